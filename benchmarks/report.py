@@ -23,7 +23,7 @@ from music_rllib.experiment.open_sweep import open_sweep
 from music_rllib.experiment.plan import make_plan
 from music_rllib.experiment.record import keep_record
 from music_rllib.report.build import PAGE
-from music_rllib.store.serialization import HISTORY, Report, RunResult, last_values, to_json_lines
+from music_rllib.store.history import HISTORY, Report, RunResult, last_values, to_json_lines
 
 __all__ = ["rows"]
 

@@ -242,7 +242,7 @@ JOURNEYS = {
         title="From a metric to the report",
         steps=(
             "`music_rllib.tac.learner:TACLearner` measures it, under a name of `music_rllib.names`",
-            "`music_rllib.store.serialization:Report` keeps it in the run's history",
+            "`music_rllib.store.history:Report` keeps it in the run's history",
             "`music_rllib.store.node_store:NodeStore` has the history of finished runs, "
             "`music_rllib.store.work_folder:WorkFolder` the history of other runs up to their last "
             "checkpoint",

@@ -21,7 +21,7 @@ from music_rllib.experiment.scheduler import Failure
 from music_rllib.search.controller import SearchController
 from music_rllib.search.outcome import outcome
 from music_rllib.search.searches import open_searches
-from music_rllib.store.serialization import HISTORY, Report, RunResult, last_values, to_json_lines
+from music_rllib.store.history import HISTORY, Report, RunResult, last_values, to_json_lines
 from music_rllib.tune.runner import DagSearcher
 
 Document = dict[str, Any]

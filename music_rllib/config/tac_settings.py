@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Discriminator, Field, Tag, model_serializer, model_validator
 
-from music_rllib.functional.distribution import matched_alpha, normalised_alpha
+from music_rllib.functional.entropy_scale import matched_alpha, normalised_alpha
 from music_rllib.intrinsic.settings import MusicSettings
 from music_rllib.schedules import (
     QUANTITIES,
@@ -347,7 +347,7 @@ def _entropy_bonus(tac: TACSettings) -> float:
     """Largest entropy bonus of a step: alpha times the entropy of one uniform action dimension."""
     if tac.policy == "deterministic":
         return 0.0
-    from music_rllib.functional.distribution import largest_entropy  # loads PyTorch
+    from music_rllib.functional.entropy_scale import largest_entropy  # loads PyTorch
 
     alpha = tac.alpha
     bonuses = [0.0]

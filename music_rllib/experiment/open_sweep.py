@@ -14,8 +14,8 @@ from music_rllib.experiment.plan import Node, Plan, budget_settings, continuatio
 from music_rllib.experiment.scheduler import DONE, Scheduler
 from music_rllib.experiment.sweep_files import PLAN, SETTINGS, SweepLocation, read_json
 from music_rllib.names import ShortLabels
+from music_rllib.store.history import RunResult
 from music_rllib.store.node_store import NodeStore, damage_in_words
-from music_rllib.store.serialization import RunResult
 from music_rllib.store.storage import DamagedError, StorageError, open_storage
 from music_rllib.store.work_folder import steps_of
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from music_rllib.experiment.plan import Node, Plan
-from music_rllib.store.serialization import Report, RunResult
+from music_rllib.store.history import Report, RunResult
 
 
 class Status(StrEnum):

@@ -18,7 +18,7 @@ from music_rllib.experiment.run_info import run_info
 from music_rllib.redaction import flat_params
 from music_rllib.results.analysis_plan import PlanVersion
 from music_rllib.results.statistics import Array
-from music_rllib.store.serialization import RunResult
+from music_rllib.store.history import RunResult
 
 Ints = NDArray[np.int64]
 

@@ -22,7 +22,7 @@ from music_rllib.search.sampler import VALUES
 from music_rllib.search.searches import Finalist, RunningTrial, Search
 from music_rllib.search.storage import DATABASE_ERRORS
 from music_rllib.search.study import SCORES, OptunaStudy
-from music_rllib.store.serialization import Report, RunResult
+from music_rllib.store.history import Report, RunResult
 from music_rllib.store.storage import DamagedError
 
 POLL_SECONDS = 1.0

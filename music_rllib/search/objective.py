@@ -15,7 +15,7 @@ from music_rllib import names
 from music_rllib.config.search import Objective, Pruning
 from music_rllib.results import statistics as st
 from music_rllib.results.statistics import Array, Estimate
-from music_rllib.store.serialization import Report
+from music_rllib.store.history import Report
 
 
 def up_to(history: Sequence[Report], env_steps: int | None) -> list[Report]:

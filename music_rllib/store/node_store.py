@@ -27,8 +27,8 @@ from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 from music_rllib.envs.fingerprint import Fingerprint
+from music_rllib.store.history import HISTORY, Report, RunResult, from_json_lines, last_values
 from music_rllib.store.sealed import MANIFEST, Manifest, SealedFolders
-from music_rllib.store.serialization import HISTORY, Report, RunResult, from_json_lines, last_values
 from music_rllib.store.storage import DamagedError, open_storage, write_atomically
 from music_rllib.store.work_folder import KEEP, WorkFolder, environment_of
 

@@ -11,9 +11,9 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from music_rllib.envs.fingerprint import Fingerprint
+from music_rllib.store.history import HISTORY
 from music_rllib.store.lease import LeaseFile
 from music_rllib.store.sealed import Manifest, SealedFolders
-from music_rllib.store.serialization import HISTORY
 from music_rllib.store.storage import DamagedError, StorageFolder
 
 FORMAT = "music_rllib checkpoint 2"

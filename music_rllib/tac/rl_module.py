@@ -21,11 +21,7 @@ from torch import Tensor, nn
 
 from music_rllib.config.tac_settings import LearnedAlpha, TACSettings
 from music_rllib.envs.values import observation_sizes
-from music_rllib.functional.distribution import (
-    bounded_log_std,
-    sample_squashed,
-    squashed_action,
-)
+from music_rllib.functional.distribution import bounded_log_std, sample_squashed, squashed_action
 from music_rllib.intrinsic.estimator import MutualInformationEstimator
 from music_rllib.tac.networks import Critics, Floats, Perceptron, RunningNormaliser
 

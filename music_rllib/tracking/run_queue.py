@@ -21,7 +21,7 @@ from music_rllib import names
 from music_rllib.experiment.run_info import RunInfo
 from music_rllib.redaction import flat_params, redact
 from music_rllib.runtime.machine import provenance_tags
-from music_rllib.store.serialization import Report
+from music_rllib.store.history import Report
 from music_rllib.tracking.client import Experiment, KnownRun, Status
 
 MAX_METRICS = 1000

@@ -34,8 +34,9 @@ from music_rllib.experiment.run_info import RunInfo, run_info
 from music_rllib.experiment.scheduler import Failure, Listener
 from music_rllib.policy.policy import policy_from_folder
 from music_rllib.redaction import redact, without_secrets
+from music_rllib.store.history import Report, RunResult
 from music_rllib.store.node_store import NodeStore
-from music_rllib.store.serialization import Report, RunResult, content_key
+from music_rllib.store.serialization import content_key
 from music_rllib.store.storage import StorageError, below
 from music_rllib.tracking.client import (
     Experiment,

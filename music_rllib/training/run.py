@@ -22,13 +22,8 @@ from music_rllib.kernels.compiling import is_kept
 from music_rllib.kernels.update import learn
 from music_rllib.replay.ring import Segment, new_segments
 from music_rllib.store.handoff import Spaces
-from music_rllib.store.serialization import (
-    Report,
-    read_arrays,
-    read_state,
-    write_arrays,
-    write_state,
-)
+from music_rllib.store.history import Report
+from music_rllib.store.serialization import read_arrays, read_state, write_arrays, write_state
 from music_rllib.store.work_folder import NewCheckpoint, SavedCheckpoint
 from music_rllib.tac.algorithm import TAC, TACConfig
 from music_rllib.tac.config import AlgorithmSettings, Split

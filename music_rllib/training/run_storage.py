@@ -23,9 +23,7 @@ from music_rllib.experiment.environments import ADVICE, EnvironmentChangedError
 from music_rllib.experiment.plan import budget_settings, continuation_key, is_continuable
 from music_rllib.runtime.machine import provenance_tags
 from music_rllib.store.handoff import NetworkWeights, read_handoff, write_handoff
-from music_rllib.store.lease import HeldLease, Lease
-from music_rllib.store.node_store import NodeStore
-from music_rllib.store.serialization import (
+from music_rllib.store.history import (
     HISTORY,
     Report,
     RunResult,
@@ -33,6 +31,8 @@ from music_rllib.store.serialization import (
     last_values,
     to_json_lines,
 )
+from music_rllib.store.lease import HeldLease, Lease
+from music_rllib.store.node_store import NodeStore
 from music_rllib.store.storage import StorageError
 from music_rllib.store.work_folder import NewCheckpoint, SavedCheckpoint, WorkFolder, steps_of
 from music_rllib.training.job import NodeJob

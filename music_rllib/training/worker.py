@@ -11,8 +11,8 @@ from ray.tune import PlacementGroupFactory, Trainable
 
 from music_rllib import names
 from music_rllib.redaction import redact
+from music_rllib.store.history import Report, to_json_lines
 from music_rllib.store.lease import LeaseLostError
-from music_rllib.store.serialization import Report, to_json_lines
 from music_rllib.store.storage import StorageError
 from music_rllib.training.failure_reason import cause_of, trace_of
 from music_rllib.training.hang_watch import RECORD, HangWatch, check_hung

@@ -15,8 +15,8 @@ from ray.tune.experiment import Trial
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.scheduler import Failure, Listener, Scheduler
 from music_rllib.redaction import redact
+from music_rllib.store.history import from_json_lines
 from music_rllib.store.node_store import NodeStore
-from music_rllib.store.serialization import from_json_lines
 from music_rllib.store.storage import DamagedError
 from music_rllib.training.failure_reason import cause_of
 from music_rllib.training.hang_watch import RECORD

@@ -18,8 +18,8 @@ from music_rllib.experiment.open_sweep import OpenSweep, open_sweep
 from music_rllib.experiment.plan import continuation_key, make_plan
 from music_rllib.experiment.record import changes_since, continued_runs_text, keep_record
 from music_rllib.store import lease as lease_module
+from music_rllib.store.history import RunResult
 from music_rllib.store.lease import Lease, LeaseFile
-from music_rllib.store.serialization import RunResult
 from music_rllib.store.storage import StorageError, open_storage
 from music_rllib.sweep.driver_lock import hold_driver_lock
 

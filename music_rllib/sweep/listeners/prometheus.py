@@ -17,7 +17,7 @@ from music_rllib import names
 from music_rllib.config.tac_settings import setting_text
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.scheduler import Failure, Listener, Scheduler, Status
-from music_rllib.store.serialization import Report, RunResult
+from music_rllib.store.history import Report, RunResult
 from music_rllib.store.storage import write_atomically
 from music_rllib.tracking.sender import Pending
 

@@ -16,7 +16,7 @@ from music_rllib.command_line import clock, new_table, percent
 from music_rllib.experiment.plan import Node, Plan
 from music_rllib.experiment.scheduler import Failure, Listener, Scheduler, Status
 from music_rllib.names import ShortLabels
-from music_rllib.store.serialization import Report, RunResult, last_values
+from music_rllib.store.history import Report, RunResult, last_values
 from music_rllib.sweep.views.results import evaluation_text, measured
 
 REFRESH_SECONDS = 0.5

@@ -24,8 +24,8 @@ from music_rllib.experiment.record import plan_document
 from music_rllib.experiment.scheduler import Failure, Listener, Status
 from music_rllib.results.data import LastValues
 from music_rllib.search.best import best_so_far, best_text
+from music_rllib.store.history import Report, RunResult, last_values
 from music_rllib.store.lease import process_start, this_machine
-from music_rllib.store.serialization import Report, RunResult, last_values
 from music_rllib.store.storage import StorageError, is_remote
 from music_rllib.store.work_folder import steps_of
 from music_rllib.sweep.views.budget import searched_runs

@@ -16,7 +16,7 @@ from music_rllib.experiment.plan import Plan, short
 from music_rllib.experiment.scheduler import Status
 from music_rllib.names import ShortLabels
 from music_rllib.results.statistics import with_interval
-from music_rllib.store.serialization import RunResult
+from music_rllib.store.history import RunResult
 
 _STYLES = {Status.FAILED: "red", Status.SKIPPED: "yellow", Status.WAITING: "yellow"}
 _STATES = {Status.STARTED: "interrupted", Status.WAITING: "not started"}

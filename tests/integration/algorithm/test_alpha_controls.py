@@ -13,7 +13,7 @@ from ray.rllib.core import DEFAULT_MODULE_ID
 from ray.rllib.policy.sample_batch import MultiAgentBatch, SampleBatch
 
 from music_rllib import names
-from music_rllib.functional.distribution import matched_alpha, normalised_alpha
+from music_rllib.functional.entropy_scale import matched_alpha, normalised_alpha
 from music_rllib.tac.algorithm import TACConfig
 from music_rllib.tac.learner import TACLearner
 

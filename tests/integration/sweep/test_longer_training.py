@@ -12,8 +12,8 @@ from music_rllib.config.run_settings import RunSettings, Variant
 from music_rllib.config.schema import Checkpoints
 from music_rllib.envs.fingerprint import digest_of, fingerprint_of
 from music_rllib.experiment.plan import budget_settings, continuation_key, is_continuable
+from music_rllib.store.history import from_json_lines
 from music_rllib.store.node_store import NodeStore
-from music_rllib.store.serialization import from_json_lines
 from music_rllib.training.worker import CAUSE, NOTES, REPORTS
 from tests.integration.sweep.test_sweep_trainable import (
     compute,

@@ -29,8 +29,8 @@ from music_rllib.experiment.plan import node_key
 from music_rllib.intrinsic.music import HELD_OUT_STEPS
 from music_rllib.policy import find_policy, load_policy
 from music_rllib.store.handoff import read_handoff
+from music_rllib.store.history import from_json_lines
 from music_rllib.store.node_store import NodeStore
-from music_rllib.store.serialization import from_json_lines
 from music_rllib.training import run as run_module
 from music_rllib.training import sample_run
 from music_rllib.training.job import NodeJob

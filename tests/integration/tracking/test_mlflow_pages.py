@@ -22,7 +22,7 @@ from music_rllib.experiment.run_info import run_info
 from music_rllib.program import app
 from music_rllib.results.archive import read_archive
 from music_rllib.results.data import Sweep
-from music_rllib.store.serialization import Report
+from music_rllib.store.history import Report
 from music_rllib.sweep.listeners.mlflow_view import VERSIONS, comparison_view
 from music_rllib.tracking.tracker import Tracker, finished_run
 from tests.integration.conftest import REPOSITORY

@@ -26,7 +26,7 @@ from music_rllib import names
 from music_rllib.experiment.run_info import RunInfo
 from music_rllib.experiment.sweep_files import SweepLocation
 from music_rllib.policy import PolicyNetwork
-from music_rllib.store.serialization import Report
+from music_rllib.store.history import Report
 from music_rllib.tracking.policy_model import write_model
 from music_rllib.tracking.run_queue import StoredRun
 from music_rllib.tracking.tracker import SweepRun, Tracker
@@ -537,7 +537,7 @@ def test_a_second_store_starts_from_empty_tables_of_the_first(
 DRIVER = """
 import sys, time
 from music_rllib import names
-from music_rllib.store.serialization import Report
+from music_rllib.store.history import Report
 from music_rllib.experiment.run_info import RunInfo
 from music_rllib.experiment.sweep_files import SweepLocation
 from music_rllib.tracking.tracker import Tracker

@@ -22,8 +22,8 @@ from music_rllib.experiment.environments import (
 from music_rllib.experiment.open_sweep import OpenSweep, open_sweep
 from music_rllib.experiment.plan import Node, continuation_key, make_plan
 from music_rllib.experiment.scheduler import Status
+from music_rllib.store.history import RunResult
 from music_rllib.store.lease import Lease
-from music_rllib.store.serialization import RunResult
 
 OLD = {"package mujoco": "3.8.0", "source lab_env.py": "a"}
 NEW = {"package mujoco": "3.8.1", "source lab_env.py": "b"}

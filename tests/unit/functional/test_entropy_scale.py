@@ -10,11 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import integrate
 
-from music_rllib.functional.distribution import (
-    entropy_pressure,
-    largest_entropy,
-    matched_alpha,
-)
+from music_rllib.functional.entropy_scale import entropy_pressure, largest_entropy, matched_alpha
 from tests.unit.functional.entropies import gaussian_entropy, joint_entropy
 
 FORMS = ["per_dimension", "joint"]

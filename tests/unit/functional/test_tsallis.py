@@ -13,10 +13,10 @@ from scipy import integrate, optimize, stats
 from music_rllib.functional.distribution import (
     MAX_EXPONENT,
     bound_active,
-    largest_entropy,
     ln_q_of_log,
     ln_q_of_policy,
 )
+from music_rllib.functional.entropy_scale import largest_entropy
 from tests.unit.functional.entropies import exp_q, gaussian_entropy, joint_entropy, ln_q
 
 orders = st.floats(0.5, 3.0)

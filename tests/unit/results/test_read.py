@@ -25,7 +25,7 @@ from music_rllib.report.tables import failures_table
 from music_rllib.results.analysis import analyse
 from music_rllib.results.read import read_sweep
 from music_rllib.results.study import study_of
-from music_rllib.store.serialization import HISTORY, Report, RunResult, last_values, to_json_lines
+from music_rllib.store.history import HISTORY, Report, RunResult, last_values, to_json_lines
 from music_rllib.store.storage import DamagedError
 from music_rllib.sweep.listeners.state_file import StateFile
 

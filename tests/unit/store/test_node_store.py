@@ -14,17 +14,17 @@ import pytest
 from fsspec.implementations.memory import MemoryFileSystem  # type: ignore[import-untyped]
 
 from music_rllib.store import node_store, sealed
-from music_rllib.store.node_store import NodeStore
-from music_rllib.store.sealed import Manifest, SealedFolders
-from music_rllib.store.serialization import (
+from music_rllib.store.history import (
     HISTORY,
     Report,
     RunResult,
-    canonical_json,
     from_json_lines,
     last_values,
     to_json_lines,
 )
+from music_rllib.store.node_store import NodeStore
+from music_rllib.store.sealed import Manifest, SealedFolders
+from music_rllib.store.serialization import canonical_json
 from music_rllib.store.storage import (
     DamagedError,
     StorageError,

@@ -35,7 +35,7 @@ from music_rllib.results.study import study_of
 from music_rllib.store import node_store
 from music_rllib.store import storage as storage_module
 from music_rllib.store.handoff import write_handoff
-from music_rllib.store.serialization import HISTORY, Report, RunResult, to_json_lines
+from music_rllib.store.history import HISTORY, Report, RunResult, to_json_lines
 from music_rllib.store.storage import DamagedError, StorageFolder
 from music_rllib.sweep import clean, driver, driver_lock
 from music_rllib.sweep.export import sweep_of_run

@@ -12,7 +12,7 @@ from music_rllib import names
 from music_rllib.config.load import load_sweep
 from music_rllib.experiment.plan import Plan, make_plan
 from music_rllib.experiment.scheduler import Scheduler
-from music_rllib.store.serialization import Report, RunResult
+from music_rllib.store.history import Report, RunResult
 from music_rllib.sweep.listeners.prometheus import PrometheusListener
 from music_rllib.tracking.sender import Pending
 

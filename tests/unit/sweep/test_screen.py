@@ -19,7 +19,7 @@ from music_rllib.experiment.plan import Plan, make_plan
 from music_rllib.experiment.scheduler import Failure, Scheduler
 from music_rllib.report.figures.palette import color_of
 from music_rllib.schedules import Linear, Piecewise
-from music_rllib.store.serialization import Report, RunResult
+from music_rllib.store.history import Report, RunResult
 from music_rllib.store.storage import resolve_storage, sweep_folder
 from music_rllib.sweep.listeners.screen import Display, Throughput
 from music_rllib.sweep.views.plan import adaptive_rows, adaptive_text, alpha_rows, plan_view

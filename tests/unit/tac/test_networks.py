@@ -8,10 +8,7 @@ import torch
 from scipy import integrate
 from torch import nn
 
-from music_rllib.functional.distribution import (
-    bounded_log_std,
-    sample_squashed,
-)
+from music_rllib.functional.distribution import bounded_log_std, sample_squashed
 from music_rllib.tac.networks import Critics, Perceptron
 
 
