@@ -40,7 +40,7 @@ class PointCarry(gym.Env[dict[str, NDArray[np.float32]], NDArray[np.float32]]):
         )
         self.action_space = _box(2)
         self.render_mode = render_mode
-        self._point = self._object = self._goal = np.zeros(2)
+        self._point = self._object = self.goal = np.zeros(2)
         self._carries = False
 
     def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
@@ -55,9 +55,9 @@ class PointCarry(gym.Env[dict[str, NDArray[np.float32]], NDArray[np.float32]]):
         angle = self.np_random.uniform(-np.pi, np.pi)
         self._point, self._carries = np.zeros(2), False
         self._object = _START_DISTANCE * np.array([np.cos(angle), np.sin(angle)])
-        self._goal = self._object
-        while np.linalg.norm(self._goal - self._object) < 2 * _REACH:
-            self._goal = self.np_random.uniform(-0.7, 0.7, 2)
+        self.goal = self._object
+        while np.linalg.norm(self.goal - self._object) < 2 * _REACH:
+            self.goal = self.np_random.uniform(-0.7, 0.7, 2)
         return self._observation(), {}
 
     def step(
@@ -77,7 +77,7 @@ class PointCarry(gym.Env[dict[str, NDArray[np.float32]], NDArray[np.float32]]):
         rows, columns = np.mgrid[1 : -1 : _PIXELS * 1j, -1 : 1 : _PIXELS * 1j]
         image = np.full((_PIXELS, _PIXELS, 3), 255, np.uint8)
         discs = (
-            (self._goal, _REACH, (170, 220, 170)),
+            (self.goal, _REACH, (170, 220, 170)),
             (self._object, 0.1, (230, 140, 40)),
             (self._point, 0.05, (40, 90, 200)),
         )
@@ -89,7 +89,7 @@ class PointCarry(gym.Env[dict[str, NDArray[np.float32]], NDArray[np.float32]]):
         return {
             "observation": np.concatenate([self._point, self._object]).astype(np.float32),
             "achieved_goal": self._object.astype(np.float32),
-            "desired_goal": self._goal.astype(np.float32),
+            "desired_goal": self.goal.astype(np.float32),
         }
 
 

@@ -127,7 +127,7 @@ def test_wheel_alone_plans_its_default_sweep(unpacked: Path, tmp_path: Path) -> 
     """Without a file the program uses a default that must have travelled in the wheel."""
     shown = _run_python("-m", "music_rllib", "plan", "preset=small", cwd=tmp_path, path=unpacked)
     assert shown.returncode == 0, shown.stdout + shown.stderr
-    assert "FetchPush" in shown.stdout
+    assert "FetchReach" in shown.stdout
     assert list(tmp_path.iterdir()) == []
 
 
