@@ -328,9 +328,6 @@ def _as_yaml(settings: Mapping[str, object]) -> str:
     return str(yaml.safe_dump(plain, sort_keys=False, allow_unicode=True))
 
 
-logger = logging.getLogger(__name__)
-
-
 class MlflowListener(Listener):
     """Logs the runs of a sweep: reports of running ones, and finished ones from the store."""
 

@@ -128,7 +128,8 @@ def test_wheel_alone_plans_its_default_sweep(unpacked: Path, tmp_path: Path) -> 
     shown = _run_python("-m", "music_rllib", "plan", "preset=small", cwd=tmp_path, path=unpacked)
     assert shown.returncode == 0, shown.stdout + shown.stderr
     assert "FetchReach" in shown.stdout
-    assert list(tmp_path.iterdir()) == []
+    written = {path.name for path in tmp_path.rglob("*") if path.is_file()}
+    assert written == {"analysis_plan.json", "analysis_plan.md"}
 
 
 # --- importing it --------------------------------------------------------------------------

@@ -151,7 +151,7 @@ def test_beside_a_second_driver_stopped_killed_and_continued(
     places = listening(process)
     assert "raylet" in set.union(*places.values())
     assert all(ip_address(place.removeprefix("::ffff:")).is_loopback for place in places), places
-    code, _, errors = call(main, tmp_path, "sweep.yaml")
+    code, _, errors = call(main, tmp_path, "run", "sweep.yaml")
     assert code == 2
     assert "must be used by one process at a time" in errors
     process.send_signal(signal.SIGINT)
