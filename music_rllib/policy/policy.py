@@ -44,7 +44,7 @@ from music_rllib.store.storage import (
 MLFLOW_FILE = "policy.safetensors"
 """File with the policy in an MLflow model."""
 _WEIGHTS = {HANDOFF_FILE, MLFLOW_FILE, f"artifacts/{MLFLOW_FILE}"}
-"""Files that a policy needs, besides those of a handoff."""
+"""Files that a policy needs in addition to those of a handoff."""
 _SHORTEST_KEY = 4
 """Shortest beginning of a key that identifies a run."""
 _LISTED = 8

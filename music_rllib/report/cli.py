@@ -79,8 +79,8 @@ def report(
     env: Annotated[
         Path | None,
         typer.Option(
-            help="A sweep's YAML file whose declared environments are created for videos, besides "
-            "built-in tasks and Gymnasium's environments.",
+            help="A sweep's YAML file whose declared environments are created for videos, in "
+            "addition to built-in tasks and Gymnasium's environments.",
         ),
     ] = None,
     serve: Annotated[
