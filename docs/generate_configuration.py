@@ -51,6 +51,7 @@ from music_rllib.config.search import (
 )
 from music_rllib.config.space import Choice, FloatRange, IntRange
 from music_rllib.config.tac_settings import (
+    ColoredNoise,
     GaussianNoise,
     LearnedAlpha,
     MatchedAlpha,
@@ -203,6 +204,8 @@ def document() -> str:
         table(rows(NormalisedAlpha, "tac.alpha.")),
         "A `tac.behaviour` with noise:",
         table(rows(GaussianNoise, "tac.behaviour.")),
+        "A `tac.behaviour` with correlated noise:",
+        table(rows(ColoredNoise, "tac.behaviour.")),
         "### music",
         table(rows(MusicSettings, "music.")),
         "### replay",

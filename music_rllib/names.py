@@ -52,6 +52,7 @@ TRAIN_SUCCESS = "training/success_rate"
 TRAIN_SUCCESS_ANY = "training/success_rate_any_step"
 TRAIN_RETURN = "training/episode_return"
 TRAIN_DISPLACEMENT = "training/object_displacement"
+TRAIN_TOUCHED = "training/object_moved_share"
 
 # MUSIC ----------------------------------------------------------------------------------------
 MI_BOUND = "mutual_information/bound"

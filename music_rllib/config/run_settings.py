@@ -42,6 +42,8 @@ class VariantRules(NamedTuple):
 _FIXED = ("estimator", "task_reward", "goals")
 _OTHER_MUSIC = frozenset(f"music.{name}" for name in MusicSettings.model_fields.keys() - {*_FIXED})
 _TRAINING_OF_ESTIMATOR = frozenset({"music.lr", "music.batch_trajectories"})
+_N_STEPS = frozenset({"replay.n_steps"})
+"""Without effect with an intrinsic reward, which is the reward of one step."""
 
 
 def _fixed(estimator: str, *, task_reward: bool, goals: str = "environment") -> dict[str, Any]:
@@ -57,11 +59,12 @@ VARIANTS: Mapping[Variant, VariantRules] = MappingProxyType(
         "music-u": VariantRules(
             fixed=_fixed("trained", task_reward=False, goals="zero"),
             # Hindsight would put achieved goals in place of the zeros.
-            without_effect=frozenset({"replay.hindsight_k", "replay.hindsight_episodes"}),
+            without_effect=_N_STEPS
+            | {"replay.hindsight_k", "replay.hindsight_episodes", "replay.hindsight_goals"},
         ),
         "music-r": VariantRules(
             fixed=_fixed("frozen", task_reward=True),
-            without_effect=_TRAINING_OF_ESTIMATOR,
+            without_effect=_TRAINING_OF_ESTIMATOR | _N_STEPS,
             starts_from="estimator",
         ),
         "music-f": VariantRules(
@@ -73,6 +76,7 @@ VARIANTS: Mapping[Variant, VariantRules] = MappingProxyType(
             fixed=_fixed("frozen", task_reward=True)
             | {"mi_reward_weight": 0.0, "prioritise_replay": True},
             without_effect=_TRAINING_OF_ESTIMATOR
+            | _N_STEPS
             | {"music.mi_reward_weight", "music.reward_scale"}
             # Replay is by the ranks of the trajectories.
             | {"replay.hindsight_episodes", "replay.priority"}
@@ -103,7 +107,10 @@ SECTIONS = ("evaluation", "tac", "music", "replay")
 LAYER_KEYS = ("env_steps", "num_envs", *SECTIONS)
 """Keys that `defaults`, a stage, its `per_task` and a grid point can set."""
 
-YOUNGER: tuple[tuple[str, str], ...] = (("tac", "log_std_form"), ("tac", "warmup_steps"))
+YOUNGER: tuple[tuple[str, str], ...] = (
+    ("tac", "log_std_form"), ("tac", "warmup_steps"),
+    ("replay", "hindsight_goals"), ("replay", "n_steps"),
+)  # fmt: skip
 """Group and name of settings that are newer than the node keys of finished runs."""
 
 RETIRED: Mapping[tuple[str, str], Any] = MappingProxyType({("tac", "precision"): "float32"})
@@ -129,13 +136,20 @@ class ReplaySettings(StrictModel):
     behavior that the policy no longer shows, and needs memory: 151 bytes per FetchPush
     transition."""
     hindsight_k: float = Field(0.0, ge=0)
-    """HER, `future` strategy: k relabeled transitions for each unchanged one. 0: off. Without it, a
+    """HER: k relabeled transitions for each unchanged one. 0: off. Without it, a
     policy rarely finds rewards that are given only at a goal."""
+    hindsight_goals: Literal["future", "final", "episode"] = "future"
+    """HER: goals of relabeled transitions are achieved later in the episode (`future`), at its end
+    (`final`), or after any of its steps (`episode`)."""
     hindsight_episodes: Literal["all", "moved"] = "all"
     """HER: `all`: relabeled transitions come from all episodes. `moved`: only from episodes that
     achieve something that their first state does not (`environments.<name>.moved_distance`);
     hindsight teaches nothing about an object at rest. No episode fills more than two fifths of a
     minibatch on average."""
+    n_steps: int = Field(1, gt=0)
+    """Steps whose rewards a critic's target adds before it bootstraps, fewer at an episode's end.
+    Rewards are computed with the relabeled goal. Larger values pass rewards on faster, with a bias:
+    the actions after the first one are not the policy's. 1 with an intrinsic reward."""
     priority: Literal["uniform", "td_error"] = "uniform"
     """Transitions are drawn uniformly, or by their TD error (PER, Schaul et al. 2016,
     proportional)."""
@@ -144,6 +158,14 @@ class ReplaySettings(StrictModel):
     surprising transitions more often, including noise."""
     importance_exponent: Annotated[Schedule, bounded("in [0, 1]", lambda b: 0 <= b <= 1)] = 0.4
     """PER: strength of the importance weights that correct its bias (beta; 1 corrects it fully)."""
+
+    def n_steps_problem(self, music: MusicSettings) -> str | None:
+        """The rule that `n_steps` breaks with these settings of the intrinsic reward."""
+        if self.n_steps == 1 or music.estimator == "none":
+            return None
+        return (
+            f"n_steps must be 1 with an intrinsic reward, which is of one step, got {self.n_steps}"
+        )
 
     @model_validator(mode="after")
     def _one_choice(self) -> Self:
@@ -249,6 +271,12 @@ class RunSettings(StrictModel):
         }
         success, entropy = self.task.success_key is not None, self.tac.policy == "stochastic"
         check_measurable(adaptive, success=success, entropy=entropy)
+        return self
+
+    @model_validator(mode="after")
+    def _intrinsic_reward_has_one_step(self) -> Self:
+        if problem := self.replay.n_steps_problem(self.music):
+            raise ValueError(f"replay.{problem}")
         return self
 
     @model_validator(mode="after")

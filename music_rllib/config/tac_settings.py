@@ -101,6 +101,22 @@ class GaussianNoise(StrictModel):
     """Share of actions that are uniformly random instead."""
 
 
+class ColoredNoise(StrictModel):
+    """Samples of the policy with noise that is correlated over the steps of an episode.
+
+    Eberhard et al. 2023, "Pink Noise Is All You Need". Each action alone has the policy's
+    distribution.
+    """
+
+    kind: Literal["colored_noise"]
+    """The kind of behavior."""
+    exponent: float = Field(1.0, ge=0, le=2)
+    """Power of the noise over frequency f is f^-exponent: 0 is white noise, as with `policy`, 1
+    pink noise, 2 Brownian noise. Higher values keep a direction for longer."""
+    random_share: float = Field(0.0, ge=0, le=1)
+    """Share of actions that are uniformly random instead."""
+
+
 def _alpha_kind(value: object) -> str:
     """Tag of the member of `Alpha` that `value` should be, by the key that only it has."""
     kinds = {"learned": LearnedAlpha, "matched_width": MatchedAlpha, "normalised": NormalisedAlpha}
@@ -139,11 +155,16 @@ def alpha_at(
 
 
 def _behaviour_kind(value: object) -> str:
+    kind = value.get("kind") if isinstance(value, dict) else getattr(value, "kind", None)
+    if kind == "colored_noise":
+        return "colored_noise"
     return "gaussian_noise" if isinstance(value, dict | GaussianNoise) else "policy"
 
 
 Behaviour = Annotated[
-    Annotated[Literal["policy"], Tag("policy")] | Annotated[GaussianNoise, Tag("gaussian_noise")],
+    Annotated[Literal["policy"], Tag("policy")]
+    | Annotated[GaussianNoise, Tag("gaussian_noise")]
+    | Annotated[ColoredNoise, Tag("colored_noise")],
     Discriminator(_behaviour_kind),
 ]
 """Method of choosing actions during training."""
@@ -214,8 +235,8 @@ class TACSettings(StrictModel):
     """Smallest standard deviation that the normalizer divides by. Larger values keep inputs small
     that hardly vary; smaller values amplify their noise."""
     behaviour: Behaviour = "policy"
-    """Actions during training: samples of the policy, or actions with the original MUSIC's
-    noise."""
+    """Actions during training: samples of the policy, with independent or correlated noise, or
+    actions with the original MUSIC's noise."""
     action_l2: float = Field(0.0, ge=0)
     """Weight of the policy's mean squared action, in [-1, 1], in its loss (original MUSIC: 1.0).
     Higher values make actions smaller, possibly too small to push an object."""
@@ -259,10 +280,10 @@ class TACSettings(StrictModel):
             )
         if self.bootstrap != "critics":
             raise ValueError("bootstrap must be 'critics' for policy: deterministic, got 'value'")
-        if self.behaviour == "policy":
+        if not isinstance(self.behaviour, GaussianNoise):
             raise ValueError(
                 "behaviour must be gaussian_noise for policy: deterministic, which would not "
-                "explore, got 'policy'"
+                f"explore, got {getattr(self.behaviour, 'kind', self.behaviour)!r}"
             )
         return self
 

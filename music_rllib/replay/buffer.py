@@ -45,8 +45,11 @@ class TrajectoryReplay(TrajectoryRing):
         capacity: largest number of transitions of full episodes, rounded down to whole episodes.
         rng: source of all random numbers of sampling.
         goal_reward: recomputes rewards of relabeled transitions; needed for hindsight.
-        hindsight_k: HER `future` (Andrychowicz et al. 2017): a share k/(1+k) of transitions gets
-            a goal that their trajectory achieved later.
+        hindsight_k: HER (Andrychowicz et al. 2017): a share k/(1+k) of transitions gets a goal
+            that their trajectory achieved.
+        hindsight_goals: achieved `future`: later; `final`: at its end; `episode`: after any step.
+        n_steps: number of rewards in a transition, fewer at the end of a trajectory.
+        gamma: discount factor of the rewards after the first.
         hindsight_episodes: `all`; or `moved`: transitions with such a goal come only from
             trajectories that have moved (Manela & Biess 2021 filter hindsight goals by the same
             idea), at most the share `LARGEST_SHARE` from one of them. If too few have moved, the
@@ -69,6 +72,9 @@ class TrajectoryReplay(TrajectoryRing):
         *,
         goal_reward: GoalReward | None = None,
         hindsight_k: float = 0.0,
+        hindsight_goals: Literal["future", "final", "episode"] = "future",
+        n_steps: int = 1,
+        gamma: float = 1.0,
         hindsight_episodes: Literal["all", "moved"] = "all",
         moved_distance: float | None = None,
         td_exponent: float | None = None,
@@ -81,6 +87,7 @@ class TrajectoryReplay(TrajectoryRing):
         self.rng = rng
         self._goal_reward = goal_reward
         self._hindsight_share = hindsight_k / (1.0 + hindsight_k)
+        self._goals, self._n_steps, self._gamma = hindsight_goals, n_steps, gamma
         self._only_moved = hindsight_episodes == "moved" and hindsight_k > 0
         self._moved_distance = moved_distance
         self._moved = np.zeros(0, np.bool_)
@@ -148,6 +155,7 @@ class TrajectoryReplay(TrajectoryRing):
         """
         start, step, length = self._draw(count)
         relabelled = self._hindsight_share > 0
+        chosen = np.zeros(0, np.int64)
         if relabelled:
             chosen = np.flatnonzero(self.rng.random(count) < self._hindsight_share)
             moved = self._moved_places
@@ -161,19 +169,50 @@ class TrajectoryReplay(TrajectoryRing):
         inputs, next_inputs = both[:, :width].copy(), both[:, after : after + width].copy()
         actions, rewards = both[:, frame : after - 2].copy(), both[:, after - 2].copy()
         if relabelled:
-            # Uniform over the later states: step + 1 to the episode's last one.
-            left = length[chosen] - step[chosen]
-            later = step[chosen] + 1 + (self.rng.random(len(chosen)) * left).astype(np.int64)
-            goals = self._read(start[chosen] + later, width, self.layout.goal)
+            goals = self._achieved(start[chosen], step[chosen], length[chosen])
             inputs[chosen, self.layout.observation :] = goals
             next_inputs[chosen, self.layout.observation :] = goals
             assert self._goal_reward is not None
             rewards[chosen] = self._goal_reward(both[chosen, after + width :], goals)
+        discounts = 1.0 - both[:, after - 1]
         weights = None
         if self._td is not None:
             weights = self._td.importance_weights(row, len(self), importance_exponent)
-        discounts = 1.0 - both[:, after - 1]
-        return Transitions(inputs, actions, rewards, discounts, next_inputs, weights, row)
+        drawn = Transitions(inputs, actions, rewards, discounts, next_inputs, weights, row)
+        for i in range(1, self._n_steps):
+            self._add_step(drawn, i, np.flatnonzero(step + i < length), chosen)
+        return drawn
+
+    def _achieved(self, start: Rows, step: Rows, length: Rows) -> Floats:
+        """[B, G] goals that the trajectories of B transitions achieved."""
+        match self._goals:
+            case "future":  # uniform over the later states: step + 1 to the episode's last one
+                uniform = self.rng.random(len(start))
+                later = step + 1 + (uniform * (length - step)).astype(np.int64)
+            case "final":
+                later = length
+            case "episode":
+                later = 1 + (self.rng.random(len(start)) * length).astype(np.int64)
+        return self._read(start + later, self.layout.network_input, self.layout.goal)
+
+    def _add_step(self, drawn: Transitions, ahead: int, rows: Rows, relabelled: Rows) -> None:
+        """Extend the transitions `rows` by the step that is `ahead` of their first one."""
+        observation, width, frame = (
+            self.layout.observation,
+            self.layout.network_input,
+            self.layout.frame,
+        )
+        after = self._steps.shape[1]
+        both = self._read(drawn.rows[rows] + ahead, 0, after + frame)
+        rewards = both[:, after - 2].copy()
+        new = np.isin(rows, relabelled)
+        if new.any():
+            assert self._goal_reward is not None
+            goals = drawn.inputs[rows[new], observation:]
+            rewards[new] = self._goal_reward(both[new, after + width :], goals)
+        drawn.rewards[rows] += self._gamma**ahead * rewards
+        drawn.discounts[rows] = self._gamma**ahead * (1.0 - both[:, after - 1])
+        drawn.next_inputs[rows, :observation] = both[:, after : after + observation]
 
     def update_priorities(self, rows: Rows, errors: Floats) -> None:
         """PER: set the priorities of `rows` [B] by their absolute TD errors [B]."""

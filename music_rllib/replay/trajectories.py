@@ -66,9 +66,9 @@ class Transitions:
     actions: Floats
     """[B, A]"""
     rewards: Floats
-    """[B] task reward, recomputed if the goal was relabeled."""
+    """[B] task reward, recomputed if the goal was relabeled; with n steps, their discounted sum."""
     discounts: Floats
-    """[B] 0 if the episode terminated, 1 otherwise."""
+    """[B] 0 if the episode terminated, 1 otherwise; with n steps, times gamma^(n - 1)."""
     next_inputs: Floats
     """[B, D + G]"""
     weights: Floats | None

@@ -253,6 +253,8 @@ class TACConfigBase(AlgorithmConfig):
                 "replay_hindsight_k must be 0 with music_goals='zero' (hindsight would replace "
                 f"the zeros by achieved goals), got {replay.hindsight_k:g}"
             )
+        if problem := replay.n_steps_problem(music):
+            self._value_error(f"replay_{problem}")
         schedules = (
             tac.entropic_index,
             getattr(tac.alpha, "value", tac.alpha),

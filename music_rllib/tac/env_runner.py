@@ -31,7 +31,7 @@ from ray.rllib.utils.metrics import (
 )
 from ray.rllib.utils.typing import StateDict
 
-from music_rllib.config.tac_settings import GaussianNoise, TACSettings
+from music_rllib.config.tac_settings import ColoredNoise, TACSettings
 from music_rllib.envs.episodes import Episode, Recording
 from music_rllib.envs.make import (
     Env,
@@ -180,10 +180,17 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
         recordings = [self._start_episode(i) for i in range(count)]
         finished: dict[int, Episode] = {}
         actor = self.module.actor()
+        behaviour, colored = self._settings.behaviour, None
+        if explore and not random_actions and isinstance(behaviour, ColoredNoise):
+            shape = (self.layout.horizon, count, self.layout.action)
+            colored = colored_noise(self._rng, behaviour.exponent, shape)
         while len(finished) < count:
             playing = [i for i in range(count) if i not in finished]
             inputs = np.stack([recordings[i].network_input for i in playing])
-            actions = self._act(actor, inputs, explore=explore, random_actions=random_actions)
+            noise = None if colored is None else colored[recordings[playing[0]].steps, playing]
+            actions = self._act(
+                actor, inputs, explore=explore, random_actions=random_actions, noise=noise
+            )
             if not actions.ravel().dot(actions.ravel()) <= actions.size:
                 raise _bad_action(actions, inputs, [recordings[i].place for i in playing])
             for i, action, scaled in zip(playing, actions, self._to_env(actions), strict=True):
@@ -231,18 +238,30 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
         """Scale actions [B, A] from [-1, 1] to the environment's bounds."""
         return to_bounds(actions, self._action_space)
 
-    def _act(self, actor: Actor, inputs: Floats, *, explore: bool, random_actions: bool) -> Floats:
-        """[B, I] -> [B, A] in [-1, 1]."""
+    def _act(
+        self,
+        actor: Actor,
+        inputs: Floats,
+        *,
+        explore: bool,
+        random_actions: bool,
+        noise: Floats | None = None,
+    ) -> Floats:
+        """[B, I] -> [B, A] in [-1, 1]; `noise` [B, A] replaces independent normal noise."""
         shape = (len(inputs), self.layout.action)
         if random_actions:
             return self._rng.uniform(-1.0, 1.0, shape).astype(np.float32)
         behaviour = self._settings.behaviour
         if not explore:
             return actor(inputs, None)
-        noise = self._rng.standard_normal(shape, dtype=np.float32)
-        if not isinstance(behaviour, GaussianNoise):
+        if noise is None:
+            noise = self._rng.standard_normal(shape, dtype=np.float32)
+        if behaviour == "policy":
             return actor(inputs, noise)
-        actions = np.clip(actor(inputs, None) + behaviour.std * noise, -1.0, 1.0)
+        if isinstance(behaviour, ColoredNoise):
+            actions = actor(inputs, noise)
+        else:
+            actions = np.clip(actor(inputs, None) + behaviour.std * noise, -1.0, 1.0)
         uniform = self._rng.uniform(-1.0, 1.0, shape).astype(np.float32)
         is_random = self._rng.random((len(inputs), 1)) < behaviour.random_share
         return np.where(is_random, uniform, actions)
@@ -322,6 +341,25 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
 
     def stop(self) -> None:
         self.close_envs()
+
+
+def colored_noise(rng: np.random.Generator, exponent: float, shape: tuple[int, ...]) -> Floats:
+    """Standard normal noise with the power f^-exponent over the first axis, of T steps.
+
+    Timmer & Koenig 1995, "On generating power law noise". Frequency 0 has the power of the lowest
+    frequency 1/T, so that the noise of an episode has a mean.
+    """
+    steps = shape[0]
+    frequency = np.maximum(np.fft.rfftfreq(steps), 1 / steps)
+    scale = frequency ** (-exponent / 2)
+    white = rng.standard_normal(shape)
+    noise = np.fft.irfft((np.fft.rfft(white, axis=0).T * scale).T, n=steps, axis=0)
+    # The variance of each step: a real signal has every frequency twice, except the first and, if T
+    # is even, the last.
+    twice = np.full(len(scale), 2.0)
+    twice[[0, -1] if steps % 2 == 0 else 0] = 1.0
+    scaled: Floats = (noise / np.sqrt((twice * scale**2).sum() / steps)).astype(np.float32)
+    return scaled
 
 
 def _bad_action(actions: Floats, inputs: Floats, places: list[str]) -> BadNumberError:

@@ -11,7 +11,7 @@ from ray.rllib.callbacks.callbacks import RLlibCallback
 
 from music_rllib.envs.values import BadNumberError
 from music_rllib.tac.algorithm import TACConfig
-from music_rllib.tac.env_runner import TrajectoryEnvRunner
+from music_rllib.tac.env_runner import TrajectoryEnvRunner, colored_noise
 from music_rllib.tac.networks import RunningNormaliser
 
 
@@ -194,8 +194,9 @@ def test_an_episode_that_tac_ends_is_truncated_in_callbacks() -> None:
     assert "is_success" in episode.get_infos(-1)
 
 
-def test_a_restored_runner_plays_the_same_episodes() -> None:
-    one, other = runner(), runner()
+@pytest.mark.parametrize("behaviour", ["policy", {"kind": "colored_noise", "random_share": 0.3}])
+def test_a_restored_runner_plays_the_same_episodes(behaviour: Any) -> None:
+    one, other = (runner(behaviour=behaviour) for _ in range(2))
     one.sample()
     other.set_state(one.get_state())
     for ours, theirs in zip(one.sample(), other.sample(), strict=True):
@@ -273,6 +274,31 @@ def test_noise_of_the_original_music() -> None:
     assert 0.25 < far.mean() < 0.32
     assert (actions - mean)[~far].std() == pytest.approx(0.05, abs=0.01)
     assert (np.abs(actions) <= 1).all()
+
+
+@pytest.mark.parametrize("exponent", [0.0, 1.0, 2.0])
+@pytest.mark.parametrize("steps", [49, 50])
+def test_colored_noise_is_standard_normal_with_the_given_spectrum(
+    exponent: float, steps: int
+) -> None:
+    noise = colored_noise(np.random.default_rng(0), exponent, (steps, 4_000, 2))
+    np.testing.assert_allclose(noise.std((1, 2)), 1.0, atol=0.06)  # at every step
+    power = (np.abs(np.fft.rfft(noise, axis=0)) ** 2).mean((1, 2))[1:25]
+    slope = np.polyfit(np.log(np.arange(1, 25)), np.log(power), 1)[0]
+    assert slope == pytest.approx(-exponent, abs=0.05)
+
+
+def test_episodes_with_colored_noise_are_samples_of_the_policy_with_random_actions(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A policy that acts by its noise shows the noise: smooth, but for the random actions."""
+    behaviour = {"kind": "colored_noise", "exponent": 2.0, "random_share": 0.2}
+    made = runner(Countdown, num_envs=500, max_episode_steps=9, behaviour=behaviour)
+    monkeypatch.setattr(made.module, "actor", lambda: lambda _, noise: np.clip(noise / 9, -1, 1))
+    ends = np.concatenate([np.diff(one.actions[:, 0]) for one in made.sample()])
+    sudden = np.abs(ends) > 0.25
+    # A step is sudden unless both of its actions are smooth, or a random one is near by chance.
+    assert 0.2 < sudden.mean() < 1 - 0.8**2
 
 
 @pytest.mark.parametrize(

@@ -93,6 +93,53 @@ def test_hindsight_takes_goals_achieved_later_and_recomputes_rewards() -> None:
     assert (buffer.packed(buffer.oldest)["frames"][:, 3] == -1.0).all()
 
 
+@pytest.mark.parametrize(
+    ("goals", "first"), [("final", lambda step, n: n), ("episode", lambda step, n: 1)]
+)
+def test_hindsight_of_the_final_state_and_of_the_whole_episode(
+    goals: str, first: Callable[[int, int], int]
+) -> None:
+    buffer = replay(100, hindsight_k=1e9, hindsight_goals=goals)
+    buffer.extend([episode(0, 5), episode(1, 3)])
+    batch = buffer.sample_transitions(4_000)
+    seen: dict[tuple[int, int], set[int]] = {}
+    for (number, step, _), goal in zip(batch.inputs[:, :3], batch.inputs[:, 3], strict=True):
+        seen.setdefault((int(number), int(step)), set()).add(int(goal - 100 * number))
+    for (number, step), reached in seen.items():
+        length = (5, 3)[number]
+        assert reached == set(range(first(step, length), length + 1))
+
+
+@pytest.mark.parametrize("n_steps", [2, 3, 9])
+@pytest.mark.parametrize("goals", ["future", "final", "episode"])
+def test_n_steps_add_the_rewards_of_the_relabeled_goal_up_to_the_end(
+    n_steps: int, goals: str
+) -> None:
+    """Every drawn transition is computed again, step by step, from the episode."""
+    gamma = 0.5
+    buffer = replay(100, hindsight_k=1.0, hindsight_goals=goals, n_steps=n_steps, gamma=gamma)
+    lengths, ends = (5, 3, 1, 4), (False, True, True, False)
+    played = [episode(n, steps, terminated=end) for n, (steps, end) in
+              enumerate(zip(lengths, ends, strict=True))]  # fmt: skip
+    for each in played:
+        each.rewards[:] = -np.arange(2, 2 + len(each))  # not those of `matches`
+    buffer.extend(played)
+    batch = buffer.sample_transitions(2_000)
+    for row in range(2_000):
+        number, step = (int(value) for value in batch.inputs[row, :2])
+        goal, source = batch.inputs[row, 3], played[number]
+        last = min(step + n_steps, lengths[number])
+        total = 0.0
+        for t in range(step, last):
+            recomputed = 0.0 if source.frames[t + 1, 4] == goal else -1.0
+            total += gamma ** (t - step) * (source.rewards[t] if goal == -1.0 else recomputed)
+        ended = ends[number] and last == lengths[number]
+        assert batch.rewards[row] == pytest.approx(total)
+        assert batch.discounts[row] == (0.0 if ended else gamma ** (last - step - 1))
+        np.testing.assert_array_equal(batch.next_inputs[row], [number, last, 0, goal])
+        np.testing.assert_array_equal(batch.actions[row], [number, step])
+
+
 def resting(number: int, steps: int) -> Trajectory:
     """An episode whose achieved goal never changes."""
     played = episode(number, steps)
