@@ -17,29 +17,44 @@ _NAMES = (
     r"password|passwd|passphrase|pwd|secret|token|credential|authorization"
     r"|(?:api|access|private)[_-]?key"
 )
-_USER_INFO = re.compile(
-    # A database's password can contain characters that end the host in other URIs.
-    r"""(?P<scheme>[A-Za-z][A-Za-z0-9+.\-]{0,40}://)
-    (?:[^/?\#\s'"]*@|[^/?\#@\s:'"\[]{0,999}:(?!\d{1,5}(?:[/?\#]|$))[^@\s]{0,999}@)""",
-    re.VERBOSE,
+_SHORT_NAMES = r"(?<![A-Za-z])(?:pass|pw)(?![A-Za-z])"
+"""Parts of other words, so they must stand alone: `DB_PASS`, not `bypass`."""
+_ITEM = r"""(?:'[^'\n]{0,999}'|"[^"\n]{0,999}"|[^'"()\[\]{}\n])"""
+_VALUE = rf"""(?:
+    [bfru]{{0,2}}(?:\"{{3}}.{{0,9999}}?(?:\"{{3}}|\Z)|\'{{3}}.{{0,9999}}?(?:\'{{3}}|\Z))
+    |[bfru]{{0,2}}\\?(?P<quote>["'])(?:\\.|[^\\\n]){{0,9999}}?(?P=quote)
+    |[(\[{{](?:{_ITEM}|[(\[{{]{_ITEM}{{0,999}}[)\]}}]){{1,999}}[)\]}}]
+    |(?:(?:Bearer|Basic)\s+)?[^\s,;&)}}\]'"]+
+)"""
+"""A text in quotes, brackets (two levels) with their content, or a word."""
+# Bounded repetitions: a long text must not take time quadratic in its length.
+_SECRETS = tuple(
+    re.compile(pattern, re.IGNORECASE | re.VERBOSE | re.DOTALL)
+    for pattern in (
+        # user:password@ of a URI. A password can contain characters that end the host elsewhere.
+        r"""(?P<name>[a-z][a-z0-9+.\-]{0,40}://)
+        (?:[^/?\#@\s:'"\[]{0,999}:(?!\d{1,5}(?:[/?\#]|$))[^@\s]{0,999}@
+        (?:(?:(?!://)[^@\s'"]){0,999}@){0,9}|[^/?\#\s'"]*@)""",
+        # A parameter of a URI: ?sig=, &X-Amz-Signature=.
+        rf"""(?P<name>[?&](?:[\w.\-]{{0,40}}?(?:{_NAMES})[\w.\-]{{0,40}}
+        |(?:[\w.\-]{{0,40}}[_.\-])?(?:pass|pw|sig|signature))(?P<equals>=))[^&\s'"]*""",
+        r"(?P<name>\bBearer(?P<equals>\s+))[\w.~+/=\-]+",
+        # An option of a command: --password x.
+        rf"""(?P<name>(?<![\w\-])--?(?:[\w\-]{{0,40}}?(?:{_NAMES})[\w\-]{{0,40}}
+        |(?:[\w\-]{{0,40}}-)?(?:pass|pw))(?P<equals>[ \t]+))(?!-){_VALUE}""",
+        # An assignment by = or :, perhaps with its value on the next line.
+        rf"""(?P<name>(?:(?:{_NAMES})[\w\-]{{0,40}}
+        |{_SHORT_NAMES}(?=\\?["']|\s{{0,9}}=|(?<=_pass):)|signature(?=\s{{0,9}}=))
+        \\?["']?\s{{0,9}}(?:(?P<equals>=)|:)[ \t]{{0,9}}
+        (?:\\?\n[ \t]{{0,40}}(?![\w.\-]{{1,40}}[ \t]{{0,9}}[:=](?:\s|$)))?){_VALUE}""",
+    )
 )
-_QUERY_SECRET = re.compile(
-    r"(?P<name>[?&](?:password|passwd|pwd|sslpassword|token|secret|access_key)=)[^&\s'\"]*", re.I
-)
-_ASSIGNED_SECRET = re.compile(
-    # Bounded repetitions: a long text must not take time quadratic in its length.
-    rf"""(?P<name>(?:{_NAMES})[\w-]{{0,40}}\\?["']?\s{{0,9}})
-    (?:(?P<equals>=[ \t]{{0,9}})|(?P<colon>:[ \t]{{0,9}}))
-    (?:\\?(?P<quote>["'])(?:\\.|[^\\\n]){{0,9999}}?(?P=quote)|(?:(?:Bearer|Basic)\s+)?[^\s,;&)}}\]'"]+)""",
-    re.IGNORECASE | re.VERBOSE,
-)
-_BEARER = re.compile(r"(?P<name>\bBearer\s+)[\w.~+/=-]+")
 # C0 and C1 controls except line breaks and tabs, marks that change the direction of writing,
 # invisible marks, and unpaired surrogates, which no terminal accepts.
 _UNPRINTABLE = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff\ud800-\udfff]"
 )
-_SECRET_KEY = re.compile(_NAMES, re.I)
+_SECRET_KEY = re.compile(rf"{_NAMES}|{_SHORT_NAMES}", re.I)
 _COUNTED_KEY = re.compile(r"tokens?", re.I)
 """A number under such a name is a count or an id."""
 _KEYED_BY_TASK = ("environments", "per_task")
@@ -49,22 +64,24 @@ _NOT_IN_A_NAME = re.compile(r"[^\w./\- ]")
 def redact(text: str) -> str:
     """``text`` without passwords.
 
-    Removes ``user:password@`` in URIs, and values that are assigned (by ``=``, ``:`` or in a URI's
-    query) to a name that contains ``password``, ``token``, ``secret``, ``api_key``,
-    ``access_key``, ``credential`` or a similar word.
+    Removes ``user:password@`` in URIs, and values that are given (by ``=``, ``:``, in a URI's query
+    or after an option of a command) to a name that contains ``password``, ``token``, ``secret``,
+    ``api_key``, ``access_key``, ``credential`` or a similar word.
     """
-    text = _USER_INFO.sub(lambda match: match["scheme"], text)
-    text = _QUERY_SECRET.sub(lambda match: match["name"] + "***", text)
-    text = _BEARER.sub(lambda match: match["name"] + "***", text)
-    return _ASSIGNED_SECRET.sub(_hidden, text)
+    for pattern in _SECRETS:
+        text = pattern.sub(_hidden, text)
+    return text
 
 
 def _hidden(match: re.Match[str]) -> str:
     """The name with ``***`` for its value, in quotes after a colon to stay YAML or JSON."""
+    groups = match.groupdict()
+    if "equals" not in groups:
+        return match["name"]
     if match["equals"] is not None:
-        return f"{match['name']}{match['equals']}***"
-    quote = match["quote"] or '"'
-    return f"{match['name']}{match['colon']}{quote}***{quote}"
+        return f"{match['name']}***"
+    quote = groups["quote"] or '"'
+    return f"{match['name']}{quote}***{quote}"
 
 
 def printable(text: str) -> str:

@@ -5,8 +5,10 @@ The page is read-only: no request changes anything.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shlex
+import socket
 import sys
 import threading
 import time
@@ -34,6 +36,8 @@ PAUSE_FACTOR = 4.0
 """Pause between two pages as a multiple of the time that the last one took."""
 READ_SECONDS = 10.0
 """Largest number of seconds to wait for more of a request, and for the next one."""
+CONNECTIONS = 32
+"""Largest number of open connections, each with a thread; a new one closes the oldest."""
 WINDOW = 120.0
 """Seconds over which the speed is measured."""
 SHOWN = 50
@@ -168,6 +172,24 @@ class Server(ThreadingHTTPServer):
     """Answers each connection in a thread."""
 
     daemon_threads = True
+
+    def __init__(self, *arguments: Any) -> None:
+        self._open: list[socket.socket] = []
+        super().__init__(*arguments)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Answer in a thread, and close the oldest connection if there are too many."""
+        self._open.append(request)
+        with contextlib.suppress(OSError):  # it has ended
+            for oldest in self._open[:-CONNECTIONS]:
+                oldest.shutdown(socket.SHUT_RDWR)
+        super().process_request(request, client_address)
+
+    def shutdown_request(self, request: Any) -> None:
+        """Close a connection."""
+        with contextlib.suppress(ValueError):
+            self._open.remove(request)
+        super().shutdown_request(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Print nothing about a tab that was closed, or about an invalid address."""

@@ -8,7 +8,9 @@ from __future__ import annotations
 import hashlib
 import hmac
 from collections.abc import Awaitable, Callable
+from ipaddress import ip_address
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from urllib.parse import urlsplit
 
 import numpy as np
 import numpy.typing as npt
@@ -204,7 +206,8 @@ def make_api(facts: PolicyFacts, act: Act, token_sha256: str | None = None) -> F
         redoc_url=None,
     )
     most_bytes = 4096 + 64 * facts.max_rows * sum(facts.parts.values())
-    api.add_middleware(_Lenient, most_bytes=most_bytes)
+    # Without a token the service listens on loopback only.
+    api.add_middleware(_Lenient, most_bytes=most_bytes, own_host=not token_sha256)
     api.add_exception_handler(RequestValidationError, _invalid)
     api.add_exception_handler(StarletteHTTPException, _refused)
     protected, unauthorized = [], Responses()
@@ -287,12 +290,25 @@ async def _invalid(_: Request, error: Exception) -> JSONResponse:
     return JSONResponse(Failure(error=rule, problems=problems).model_dump(), status_code=422)
 
 
-class _Lenient:
-    """Middleware that treats HEAD as GET and any body as JSON, and rejects too long bodies."""
+def _is_loopback(host: str) -> bool:
+    """Whether a Host header names this machine."""
+    try:
+        name = urlsplit(f"//{host}").hostname or ""
+        return name == "localhost" or ip_address(name).is_loopback
+    except ValueError:
+        return False
 
-    def __init__(self, app: ASGIApp, most_bytes: int) -> None:
+
+class _Lenient:
+    """Middleware that treats HEAD as GET and any body as JSON, and rejects too long bodies.
+
+    With `own_host` it also rejects requests whose Host header names another machine.
+    """
+
+    def __init__(self, app: ASGIApp, most_bytes: int, *, own_host: bool) -> None:
         self._app = app
         self._most_bytes = most_bytes
+        self._own_host = own_host
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -308,6 +324,12 @@ class _Lenient:
                 raise HTTPException(413, f"the body must be <= {self._most_bytes} bytes")
             return message
 
+        host = dict(scope["headers"]).get(b"host", b"").decode("latin-1")
+        if self._own_host and not _is_loopback(host):
+            # Another host name that resolves to this machine is an attack (DNS rebinding).
+            failure = Failure(error=f"the Host header must name this machine, got {host!r}")
+            await JSONResponse(failure.model_dump(), 403)(scope, receive, send)
+            return
         headers = [header for header in scope["headers"] if header[0] != b"content-type"]
         headers.append((b"content-type", b"application/json"))
         # The server itself leaves out the body of an answer to HEAD.

@@ -56,7 +56,7 @@ class HangWatch:
         self._calls.share(calls)
         self._stack = stack.open("w")
         faulthandler.register(signal.SIGUSR2, self._stack, all_threads=True)
-        names = (str(calls), str(stack), storage, f"work/{key}/{RECORD}", attempt)
+        names = (str(calls), str(stack), f"work/{key}/{RECORD}", attempt)
         self._process = subprocess.Popen(  # noqa: S603
             # -P: no module of this file's folder may replace one of Python.
             [sys.executable, "-P", __file__, str(os.getpid()), str(seconds), *names],
@@ -65,6 +65,10 @@ class HangWatch:
             stderr=subprocess.DEVNULL,
             env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
         )
+        assert self._process.stdin is not None
+        # Not an argument: the URI may hold a key, and every user can read command lines.
+        self._process.stdin.write(os.fsencode(f"{storage}\n"))
+        self._process.stdin.flush()
 
     def end(self) -> None:
         """End the watching process."""
@@ -121,7 +125,8 @@ def _call_in(stack: str) -> str:
 
 def main() -> None:
     """Watch the process that the arguments name until it ends or hangs."""
-    pid, seconds, calls, stack, storage, record, attempt = sys.argv[1:]
+    pid, seconds, calls, stack, record, attempt = sys.argv[1:]
+    storage = os.fsdecode(sys.stdin.buffer.readline()).rstrip("\n")
     try:
         if not _hangs(int(pid), float(seconds), Path(calls)):
             return

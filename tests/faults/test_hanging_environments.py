@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
 from music_rllib.tac.env_runner import TrajectoryEnvRunner
@@ -87,6 +88,9 @@ def test_slow_calls_and_updates_are_not_hangs(what: str, tmp_path: Path) -> None
     with worker(tmp_path, what) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "watched\n"
+        (watching,) = psutil.Process(process.pid).children()
+        # The URI of a storage may hold a key, and every user can read command lines.
+        assert str(tmp_path) not in watching.cmdline()
         if what == "stopped":
             process.send_signal(signal.SIGSTOP)
             time.sleep(2.5)

@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from itertools import chain, repeat
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
@@ -122,6 +123,26 @@ def test_an_incomplete_request_is_closed(served: str) -> None:
     with socket.create_connection(("127.0.0.1", port), timeout=30) as client:
         client.sendall(b"GET / HTTP/1.1\r\nHost: local")
         assert client.recv(1) == b"", "the connection is closed"
+
+
+def test_many_incomplete_requests_neither_hold_threads_nor_keep_others_out() -> None:
+    page: Any = SimpleNamespace(html="<p>page")
+    http = live.make_server(page, 0)
+    thread = threading.Thread(target=http.serve_forever, daemon=True)
+    thread.start()
+    threads, half = threading.active_count(), []
+    for _ in range(300):
+        half.append(socket.create_connection(("127.0.0.1", http.server_port), timeout=30))
+        half[-1].sendall(b"GET / HTTP/1.1\r\nHost: local")
+    assert ask(f"http://127.0.0.1:{http.server_port}/") == (200, "<p>page")
+    deadline = time.monotonic() + 5
+    while threading.active_count() > threads + live.CONNECTIONS:
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    for client in half:
+        client.close()
+    http.shutdown()
+    http.server_close()
 
 
 def test_the_command_to_stop_or_resume_has_no_keys(tmp_path: Path) -> None:

@@ -215,8 +215,20 @@ def test_facts_health_and_openapi(url: str) -> None:
     assert requests.get(f"{url}/nowhere", timeout=60).json()["error"] == "Not Found"
 
 
+def test_without_a_token_only_requests_to_this_machine_are_answered(url: str) -> None:
+    """A page that resolves its own name to this machine must not read the policy."""
+    for host in ("localhost", "127.0.0.1:80", "[::1]:8000"):
+        assert requests.get(f"{url}/policy", headers={"Host": host}, timeout=60).ok
+    for host in ("evil.example", "127.0.0.1.evil.example:8000", "10.0.0.1", ""):
+        answer = requests.post(f"{url}/act", json=GOOD, headers={"Host": host}, timeout=60)
+        assert answer.status_code == 403
+        assert "Host header" in answer.json()["error"]
+
+
 def test_a_token_is_asked_for_where_there_is_one() -> None:
     with serving(token="hunter2") as url:
+        elsewhere = {"Host": "policy.example", "Authorization": "Bearer hunter2"}
+        assert requests.get(f"{url}/policy", headers=elsewhere, timeout=60).ok
 
         def status(headers: dict[str, str], path: str = "/act") -> int:
             return requests.post(f"{url}{path}", json=GOOD, headers=headers, timeout=60).status_code
