@@ -108,7 +108,7 @@ LAYER_KEYS = ("env_steps", "num_envs", *SECTIONS)
 """Keys that `defaults`, a stage, its `per_task` and a grid point can set."""
 
 YOUNGER: tuple[tuple[str, str], ...] = (
-    ("tac", "log_std_form"), ("tac", "warmup_steps"),
+    ("tac", "log_std_form"), ("tac", "warmup_steps"), ("tac", "layer_norm"),
     ("replay", "hindsight_goals"), ("replay", "n_steps"),
 )  # fmt: skip
 """Group and name of settings that are newer than the node keys of finished runs."""
@@ -209,6 +209,7 @@ class RunSettings(StrictModel):
         """Settings that determine the shapes or the meaning of the networks' arrays."""
         return Architecture(
             hidden_sizes=self.tac.hidden_sizes,
+            layer_norm=self.tac.layer_norm,
             policy=self.tac.policy,
             bootstrap=self.tac.bootstrap,
             normalise_observations=self.tac.normalise_observations,

@@ -195,6 +195,10 @@ class TACSettings(StrictModel):
     hidden_sizes: tuple[Annotated[int, Field(gt=0)], ...] = Field((256, 256, 256), min_length=1)
     """Hidden layers (ReLU) of policy, value and critics. 3 x 256 takes nearly four times as long as
     3 x 128."""
+    layer_norm: Literal["none", "critics", "all"] = "none"
+    """Layer normalization before each ReLU of the critics, or of all networks, without affine
+    parameters. It bounds what critics extrapolate to new actions (RLPD), so that they stay sound
+    at a higher `replay_ratio`."""
     log_std_bounds: tuple[float, float] = (-20.0, 2.0)
     """Range of the policy's log standard deviation. A higher lower bound keeps noise in the actions
     until the end."""

@@ -9,6 +9,7 @@ Shape legend: R rows, I inputs, O outputs, H units of the first layer, L layers,
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,8 +22,25 @@ Array = NDArray[Any]
 Rows = NDArray[np.int64]
 
 
+LAYER_NORM_EPSILON = 1e-5
+"""Added to the variance in layer normalization, as in PyTorch."""
+
+
+class Normalized(NamedTuple):
+    """Results of layer normalization in the last forward pass, needed by its derivative."""
+
+    outputs: Array
+    """Normalized outputs of all hidden layers, before ReLU; or [R, O] those of one layer."""
+    inverse_std: Array
+    """One number for each row of each hidden layer; or [R] those of one layer."""
+
+
 class Network(NamedTuple):
-    """A perceptron with ReLU between its layers and a linear output."""
+    """A perceptron with ReLU between its layers and a linear output.
+
+    Networks with and without layer normalization have different types, so that neither's machine
+    code contains the other's.
+    """
 
     values: Array
     """[S] parameters of this network and of others."""
@@ -38,6 +56,8 @@ class Network(NamedTuple):
     """Whether weights are [O, I], as in `torch.nn.Linear`; otherwise [I, O]."""
     kept: Array
     """Outputs of all layers in the last forward pass."""
+    normalized: Normalized | None
+    """None: hidden layers have no layer normalization."""
 
 
 # -- layers ---------------------------------------------------------------------------------
@@ -87,6 +107,46 @@ def relu_backward(gradient: Array, outputs: Array) -> None:
         gradient[o] = zero if outputs[o] <= zero else gradient[o]
 
 
+@partial(compiled, any_order=True)
+def layer_norm_relu(row: Array, normalized: Array) -> float:
+    """Layer normalization without affine parameters (Ba et al. 2016, 1607.06450), then ReLU.
+
+    Args:
+        row: [O] outputs of a linear layer, changed in place.
+        normalized: [O] receives the values before ReLU.
+
+    Returns:
+        The factor of the row: 1 / its standard deviation.
+    """
+    zero, share = row.dtype.type(0), row.dtype.type(1.0 / len(row))
+    mean = squares = zero
+    for o in range(len(row)):
+        mean += row[o]
+    mean *= share
+    for o in range(len(row)):
+        row[o] -= mean
+        squares += row[o] * row[o]
+    factor: float = row.dtype.type(1.0 / np.sqrt(squares * share + LAYER_NORM_EPSILON))
+    for o in range(len(row)):
+        normalized[o] = row[o] * factor
+        row[o] = max(normalized[o], zero)
+    return factor
+
+
+@partial(compiled, any_order=True)
+def layer_norm_backward(gradient: Array, normalized: Array, factor: float) -> None:
+    """Turn the gradient [O] of normalized outputs into that of the outputs of the linear layer."""
+    share = gradient.dtype.type(1.0 / len(gradient))
+    mean = along = gradient.dtype.type(0)
+    for o in range(len(gradient)):
+        mean += gradient[o]
+        along += gradient[o] * normalized[o]
+    mean *= share
+    along *= share
+    for o in range(len(gradient)):
+        gradient[o] = (gradient[o] - mean - normalized[o] * along) * factor
+
+
 # -- the perceptron -------------------------------------------------------------------------
 
 
@@ -109,10 +169,49 @@ def _bias(network: Network, flat: Array, layer: int) -> Array:
 @compiled
 def layer_outputs(network: Network, layer: int, rows: int) -> Array:
     """[R, O] a view of a layer's outputs in the last forward pass, which had R rows."""
-    start, size = 0, network.sizes[layer + 1]
+    outputs: Array = _outputs_in(network.kept, network.sizes, layer, rows)
+    return outputs
+
+
+@compiled
+def _outputs_in(flat: Array, sizes: Array, layer: int, rows: int) -> Array:
+    """[R, O] a layer's part of concatenated outputs."""
+    start, size = 0, sizes[layer + 1]
     for below in range(1, layer + 1):
-        start += rows * network.sizes[below]
-    return network.kept[start : start + rows * size].reshape((rows, size))
+        start += rows * sizes[below]
+    outputs: Array = flat[start : start + rows * size].reshape((rows, size))
+    return outputs
+
+
+# The following functions get None for a network without layer normalization. The compiler then
+# drops their other branch.
+
+
+@compiled
+def _of_layer(normalized: Any, sizes: Array, layer: int, rows: int) -> Any:
+    """`Normalized` of one hidden layer."""
+    if normalized is None:
+        return None
+    inverse_std = normalized.inverse_std[layer * rows : (layer + 1) * rows]
+    return Normalized(_outputs_in(normalized.outputs, sizes, layer, rows), inverse_std)
+
+
+@compiled
+def _hidden(row: Array, bias: Array, normalized: Any, r: int) -> None:
+    """Bias, layer normalization and ReLU of row r."""
+    if normalized is None:
+        add_bias_relu(row, bias)
+    else:
+        add_bias(row, bias)
+        normalized.inverse_std[r] = layer_norm_relu(row, normalized.outputs[r])
+
+
+@compiled
+def _hidden_backward(gradient: Array, outputs: Array, normalized: Any, r: int) -> None:
+    """Derivative of `_hidden`, except for the bias."""
+    relu_backward(gradient, outputs)
+    if normalized is not None:
+        layer_norm_backward(gradient, normalized.outputs[r], normalized.inverse_std[r])
 
 
 @compiled
@@ -125,10 +224,12 @@ def forward(network: Network, inputs: Array) -> Array:
         out = layer_outputs(network, layer, rows)
         weights = layer_weights(network, network.values, layer)
         linear(inputs, weights, network.by_outputs, out)
-        for r in range(rows):
-            if layer < last:
-                add_bias_relu(out[r], bias)
-            else:
+        if layer < last:
+            normalized = _of_layer(network.normalized, network.sizes, layer, rows)
+            for r in range(rows):
+                _hidden(out[r], bias, normalized, r)
+        else:
+            for r in range(rows):
                 add_bias(out[r], bias)
         inputs = out
     return inputs
@@ -149,7 +250,7 @@ def backward(
         scratch: overwritten.
 
     Returns:
-        [R', H] gradient of the first layer's outputs before ReLU.
+        [R', H] gradient of the first layer's outputs before layer normalization and ReLU.
     """
     last = len(network.sizes) - 2
     bias = _bias(network, network.gradients, last)
@@ -168,8 +269,9 @@ def backward(
         linear_backward_inputs(gradient, weights, network.by_outputs, out)
         bias = _bias(network, network.gradients, layer - 1)
         bias[:] = 0
+        normalized = _of_layer(network.normalized, network.sizes, layer - 1, len(inputs))
         for r in range(len(rows)):
-            relu_backward(out[r], below[rows[r]])
+            _hidden_backward(out[r], below[rows[r]], normalized, rows[r])
             if r < learned:
                 add_bias(bias, out[r])
         gradient = out

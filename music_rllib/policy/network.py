@@ -23,6 +23,10 @@ import safetensors
 from safetensors.numpy import save as save_safetensors
 
 FORMAT = "music_rllib policy 1"
+LAYER_NORM_FORMAT = "music_rllib policy 2"
+"""The format of policies with layer normalization, which older versions must not read."""
+LAYER_NORM_EPSILON = 1e-5
+"""Added to the variance in layer normalization, as in training."""
 MOST_HEADER_BYTES = 1 << 20
 """Largest header of a policy's file, which may come from anywhere; ours have a few thousand."""
 _HEADER = "music_rllib_policy"
@@ -56,6 +60,8 @@ class PolicyNetwork:
     """[A] the environment's highest actions."""
     goal_size: int
     """G, 0 for an environment without goals."""
+    layer_norm: bool = False
+    """Whether the outputs of each hidden layer are normalized before ReLU."""
     about: Mapping[str, Any] = field(default_factory=dict)
     """The run that it comes from, as JSON values; they do not influence actions."""
 
@@ -122,7 +128,7 @@ class PolicyNetwork:
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             hidden = hidden @ weight.T + bias
             if i < last:
-                hidden = np.maximum(hidden, 0.0)
+                hidden = np.maximum(_normalized(hidden) if self.layer_norm else hidden, 0.0)
         action = np.tanh(hidden[..., : self.action_size])
         scaled = self.low + (action + 1.0) * 0.5 * (self.high - self.low)
         bounded: Floats = np.clip(scaled, self.low, self.high).astype(np.float32)
@@ -157,7 +163,7 @@ class PolicyNetwork:
         arrays |= {"normaliser.mean": self.mean, "normaliser.inverse_std": self.inverse_std}
         arrays |= {"action.low": self.low, "action.high": self.high}
         header = {
-            "format": FORMAT,
+            "format": LAYER_NORM_FORMAT if self.layer_norm else FORMAT,
             "clip": self.clip,
             "goal_size": self.goal_size,
             "about": dict(self.about),
@@ -178,8 +184,9 @@ class PolicyNetwork:
                 if {file.get_slice(name).get_dtype() for name in names} != {"F32"}:
                     raise ValueError("its arrays must be float32")
                 arrays = {name: file.get_tensor(name) for name in names}
-            if not isinstance(header, dict) or header.get("format") != FORMAT:
-                raise ValueError(f"its header must say {FORMAT!r}")
+            formats = (FORMAT, LAYER_NORM_FORMAT)
+            if not isinstance(header, dict) or header.get("format") not in formats:
+                raise ValueError(f"its header must say {' or '.join(map(repr, formats))}")
             if not isinstance(header["about"], dict):
                 raise ValueError("its header must say what it is about")
             count = sum(name.endswith(".bias") for name in arrays)
@@ -192,6 +199,7 @@ class PolicyNetwork:
                 low=arrays["action.low"],
                 high=arrays["action.high"],
                 goal_size=int(header["goal_size"]),
+                layer_norm=header["format"] == LAYER_NORM_FORMAT,
                 about=header["about"],
             )
         except KeyError as error:
@@ -200,6 +208,15 @@ class PolicyNetwork:
             raise PolicyFileError(f"{path} must be a policy: its header is too deep") from None
         except _UNREADABLE as error:
             raise PolicyFileError(f"{path} must be a policy: {error}") from None
+
+
+def _normalized(hidden: Floats) -> Floats:
+    """[..., H] with mean 0 and variance 1 in each row."""
+    shifted = hidden - hidden.mean(-1, keepdims=True)
+    normalized: Floats = shifted / np.sqrt(
+        (shifted**2).mean(-1, keepdims=True) + LAYER_NORM_EPSILON
+    )
+    return normalized
 
 
 _UNREADABLE = (

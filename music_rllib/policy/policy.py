@@ -186,6 +186,7 @@ def _network(parts: Mapping[str, Mapping[str, NDArray[Any]]], info: HandoffInfo)
         low=np.asarray(spaces.action_low, np.float32),
         high=np.asarray(spaces.action_high, np.float32),
         goal_size=spaces.goal_size,
+        layer_norm=info.architecture.layer_norm == "all",
         about={**about, "max_episode_steps": limit},
     )
 

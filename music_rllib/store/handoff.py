@@ -51,6 +51,7 @@ class Architecture(_Strict):
     """The settings that determine the shapes and the meaning of network weights."""
 
     hidden_sizes: tuple[int, ...]
+    layer_norm: str = "none"
     policy: str
     bootstrap: str
     normalise_observations: bool
@@ -65,7 +66,8 @@ class Architecture(_Strict):
         if starts_from == "estimator":
             fits = self.estimator_hidden_size == other.estimator_hidden_size
             return [] if fits else ["music.hidden_size"]
-        fields = ["hidden_sizes", "policy", "bootstrap", "normalise_observations", "log_std_form"]
+        fields = ["hidden_sizes", "layer_norm", "policy", "bootstrap", "normalise_observations"]
+        fields.append("log_std_form")
         if self.log_std_form == other.log_std_form:
             fields.append("log_std_bounds")
         return [f"tac.{name}" for name in fields if getattr(self, name) != getattr(other, name)]

@@ -21,7 +21,7 @@ from music_rllib import names
 from music_rllib.kernels.adam import AdamStep, FlatParameters, FusedAdam
 from music_rllib.kernels.blas import use_threads
 from music_rllib.kernels.distribution import Distribution
-from music_rllib.kernels.layers import Network
+from music_rllib.kernels.layers import Array, Network, Normalized
 from music_rllib.kernels.update import Averages, Batch, Networks, UpdateSettings, learn
 from music_rllib.tac.networks import Critics, Perceptron, RunningNormaliser
 from music_rllib.tac.rl_module import EstimatorModule, TACModule
@@ -202,7 +202,9 @@ def _perceptron(network: Perceptron, flat: FlatParameters, rows: int) -> Network
     weights = [flat.start(layer.weight) for layer in layers]
     biases = [flat.start(layer.bias) for layer in layers]
     sizes = [layers[0].in_features, *(layer.out_features for layer in layers)]
-    return _network(flat, sizes, weights, biases, rows, by_outputs=True)
+    return _network(
+        flat, sizes, weights, biases, rows, by_outputs=True, layer_norm=network.layer_norm
+    )
 
 
 def _critics(network: Critics, flat: FlatParameters, rows: int) -> tuple[Network, Network]:
@@ -212,15 +214,21 @@ def _critics(network: Critics, flat: FlatParameters, rows: int) -> tuple[Network
     def critic(c: int) -> Network:
         weights = [flat.start(weight) + c * weight[c].numel() for weight in network.weights]
         biases = [flat.start(bias) + c * bias[c].numel() for bias in network.biases]
-        return _network(flat, sizes, weights, biases, rows, by_outputs=False)
+        return _network(
+            flat, sizes, weights, biases, rows, by_outputs=False, layer_norm=network.layer_norm
+        )
 
     return critic(0), critic(network.count - 1)
 
 
 def _network(
     flat: FlatParameters, sizes: list[int], weights: list[int], biases: list[int], rows: int,
-    *, by_outputs: bool,
+    *, by_outputs: bool, layer_norm: bool,
 ) -> Network:  # fmt: skip
+    def room(numbers: int) -> Array:
+        return flat.values.new_empty(rows * numbers).numpy()
+
+    hidden = sizes[1:-1]
     return Network(
         values=flat.values.numpy(),
         gradients=flat.gradients.numpy(),
@@ -228,5 +236,6 @@ def _network(
         weights=np.array(weights),
         biases=np.array(biases),
         by_outputs=by_outputs,
-        kept=flat.values.new_empty(rows * sum(sizes[1:])).numpy(),
+        kept=room(sum(sizes[1:])),
+        normalized=Normalized(room(sum(hidden)), room(len(hidden))) if layer_norm else None,
     )

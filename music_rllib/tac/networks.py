@@ -24,14 +24,20 @@ alternates between two adjacent float32 numbers."""
 
 
 class Perceptron(nn.Sequential):
-    """Linear layers with ReLU between them; [..., I] -> [..., O] in float32."""
+    """Linear layers with ReLU between them; [..., I] -> [..., O] in float32.
 
-    def __init__(self, inputs: int, hidden_sizes: Sequence[int], outputs: int) -> None:
+    With `layer_norm`, each hidden layer is normalized before ReLU, without affine parameters.
+    """
+
+    def __init__(
+        self, inputs: int, hidden_sizes: Sequence[int], outputs: int, *, layer_norm: bool = False
+    ) -> None:
         layers: list[nn.Module] = []
         for size in hidden_sizes:
             layers += [nn.Linear(inputs, size), nn.ReLU()]
             inputs = size
         super().__init__(*layers, nn.Linear(inputs, outputs))
+        self.layer_norm = layer_norm
         self._linear = [layer for layer in self if isinstance(layer, nn.Linear)]
 
     def forward(self, inputs: Tensor) -> Tensor:
@@ -39,7 +45,7 @@ class Perceptron(nn.Sequential):
         hidden = inputs
         # Not as modules: with few rows, calls of modules take half of the products' time.
         for layer in hidden_layers:
-            hidden = torch.relu_(F.linear(hidden, layer.weight, layer.bias))
+            hidden = _relu(F.linear(hidden, layer.weight, layer.bias), self.layer_norm)
         return F.linear(hidden, last.weight, last.bias)
 
     def in_numpy(self) -> Callable[[Floats], Floats]:
@@ -55,11 +61,21 @@ class Perceptron(nn.Sequential):
             for weight, bias in hidden_layers:
                 hidden = hidden @ weight
                 hidden += bias
+                if self.layer_norm:
+                    hidden = F.layer_norm(torch.from_numpy(hidden), hidden.shape[-1:]).numpy()
                 np.maximum(hidden, 0.0, out=hidden)
             outputs: Floats = hidden @ last + last_bias
             return outputs
 
         return forward
+
+
+def _relu(hidden: Tensor, layer_norm: bool) -> Tensor:
+    """ReLU of [..., H], after layer normalization if requested.
+
+    In place: another matrix of this size costs more than the operation.
+    """
+    return torch.relu_(F.layer_norm(hidden, hidden.shape[-1:]) if layer_norm else hidden)
 
 
 class Critics(nn.Module):
@@ -68,9 +84,11 @@ class Critics(nn.Module):
     C is 2, or 1 for DDPG. All first layers read the same input, so they are a single product.
     """
 
-    def __init__(self, inputs: int, hidden_sizes: Sequence[int], count: int = 2) -> None:
+    def __init__(
+        self, inputs: int, hidden_sizes: Sequence[int], count: int = 2, *, layer_norm: bool = False
+    ) -> None:
         super().__init__()
-        self.count = count
+        self.count, self.layer_norm = count, layer_norm
         sizes = [inputs, *hidden_sizes, 1]
         self.weights = nn.ParameterList()
         self.biases = nn.ParameterList()
@@ -97,10 +115,9 @@ class Critics(nn.Module):
         _, fan_in, width = first_weight.shape
         stacked = first_weight.transpose(0, 1).reshape(fan_in, self.count * width)
         hidden = (inputs @ stacked).view(-1, self.count, width).transpose(0, 1) + first_bias
-        # ReLU in place: another matrix of this size costs more than the operation.
-        hidden = torch.relu_(hidden)
+        hidden = _relu(hidden, self.layer_norm)
         for weight, bias in others:
-            hidden = torch.relu_(torch.baddbmm(bias, hidden, weight))
+            hidden = _relu(torch.baddbmm(bias, hidden, weight), self.layer_norm)
         return hidden
 
     def _layers(self, frozen: bool) -> Iterator[tuple[Tensor, Tensor]]:

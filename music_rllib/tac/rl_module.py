@@ -89,11 +89,13 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
         self.input_size, self.action_size = inputs, actions
         self.deterministic = settings.policy == "deterministic"
         outputs = actions if self.deterministic else 2 * actions
-        self.policy = Perceptron(inputs, sizes, outputs)
+        every = settings.layer_norm == "all"
+        self.policy = Perceptron(inputs, sizes, outputs, layer_norm=every)
         count = 1 if self.deterministic else 2
-        self.critics = Critics(inputs + actions, sizes, count)
+        of_critics = settings.layer_norm != "none"
+        self.critics = Critics(inputs + actions, sizes, count, layer_norm=of_critics)
         if settings.bootstrap == "value":
-            self.value = Perceptron(inputs, sizes, 1)
+            self.value = Perceptron(inputs, sizes, 1, layer_norm=every)
         self.normaliser: nn.Module = nn.Identity()
         if settings.normalise_observations:
             self.normaliser = RunningNormaliser(

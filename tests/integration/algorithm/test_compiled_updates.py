@@ -133,6 +133,7 @@ def test_gradients_equal_autograd_at_every_q(q: float, form: str, backbone: str)
         {"target_bounds": (-0.5, 0.5)},
         {"normalise_observations": False},
         {"log_std_form": "tanh", "log_std_bounds": (-2.0, 1.0)},
+        {"layer_norm": "all"},
     ],
     ids=str,
 )

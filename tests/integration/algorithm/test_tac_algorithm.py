@@ -202,6 +202,7 @@ CHANGES: dict[str, tuple[Any, dict[str, Any]]] = {
     "bootstrap": ("critics", {}),
     "policy_critic": ("first", {}),
     "hidden_sizes": ((32, 16), {}),
+    "layer_norm": ("critics", {}),
     "log_std_bounds": ((-1.0, -0.5), {}),
     "log_std_form": ("tanh", {}),
     "lr": (3e-4, {}),

@@ -516,10 +516,11 @@ def test_policies_need_the_same_networks_on_both_sides(
         {"name": "f", "variant": "music-f", "init_from": "u"},
     ]
     load(changed(stages=stages))
-    stages[1]["tac"] = {"hidden_sizes": [64], "normalise_observations": False}
+    stages[1]["tac"] = {"hidden_sizes": [64], "normalise_observations": False, "layer_norm": "all"}
     lines = problems(changed(stages=stages))
     assert [line.split("needs the same ")[1] for line in lines] == [
         "tac.hidden_sizes in stage f as in stage u",
+        "tac.layer_norm in stage f as in stage u",
         "tac.normalise_observations in stage f as in stage u",
     ]
     # The same numbers would be other widths.

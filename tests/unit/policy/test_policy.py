@@ -38,7 +38,8 @@ class Trained:
         torch.manual_seed(0)
         self.deterministic = run.tac.policy == "deterministic"
         outputs = ACTIONS if self.deterministic else 2 * ACTIONS
-        self.policy = Perceptron(INPUTS, run.tac.hidden_sizes, outputs)
+        layer_norm = run.tac.layer_norm == "all"
+        self.policy = Perceptron(INPUTS, run.tac.hidden_sizes, outputs, layer_norm=layer_norm)
         self.normaliser = RunningNormaliser(INPUTS, epsilon=0.01, clip=CLIP)
         self.normaliser.update(torch.randn(50, INPUTS) * 3 + 1)
         self.run = run
@@ -78,8 +79,17 @@ def observations() -> np.ndarray[Any, Any]:
         {"normalise_observations": False},
         {"policy": "deterministic", "bootstrap": "critics"},
         {"log_std_form": "tanh", "log_std_bounds": [-5.0, 2.0]},
+        {"layer_norm": "all"},
+        {"layer_norm": "critics"},
     ],
-    ids=["usual", "without normaliser", "deterministic", "scaled widths"],
+    ids=[
+        "usual",
+        "without normaliser",
+        "deterministic",
+        "scaled widths",
+        "layer norm",
+        "layer norm in critics only",
+    ],
 )
 def test_acts_like_the_networks(
     tmp_path: Path, observations: np.ndarray[Any, Any], tac: dict[str, Any]
@@ -116,8 +126,11 @@ def test_a_handoff_alone_acts_as_its_run(
     np.testing.assert_allclose(policy.act(observations), trained.act(observations), atol=2e-6)
 
 
-def test_one_file_holds_all_of_it(tmp_path: Path, observations: np.ndarray[Any, Any]) -> None:
-    policy = load_policy(Trained(_run()).write(tmp_path / "node"))
+@pytest.mark.parametrize("layer_norm", ["none", "all"])
+def test_one_file_holds_all_of_it(
+    tmp_path: Path, observations: np.ndarray[Any, Any], layer_norm: str
+) -> None:
+    policy = load_policy(Trained(_run(layer_norm=layer_norm)).write(tmp_path / "node"))
     (tmp_path / "packed.safetensors").write_bytes(policy.to_bytes())
     again = load_policy(tmp_path / "packed.safetensors")
     np.testing.assert_array_equal(again.act(observations), policy.act(observations))

@@ -39,7 +39,7 @@ def test_log_density_keeps_its_digits_where_tanh_saturates() -> None:
 def as_two_perceptrons(critics: Critics, sizes: list[int]) -> list[Perceptron]:
     copies = []
     for which in range(2):
-        copy = Perceptron(sizes[0], sizes[1:], 1)
+        copy = Perceptron(sizes[0], sizes[1:], 1, layer_norm=critics.layer_norm)
         linears = [layer for layer in copy if isinstance(layer, nn.Linear)]
         for layer, weight, bias in zip(linears, critics.weights, critics.biases, strict=True):
             layer.weight.data = weight[which].T.clone()
@@ -48,10 +48,11 @@ def as_two_perceptrons(critics: Critics, sizes: list[int]) -> list[Perceptron]:
     return copies
 
 
+@pytest.mark.parametrize("layer_norm", [False, True])
 @pytest.mark.parametrize("sizes", [[7, 16], [7, 16, 16, 8]])
-def test_twin_critics_are_two_separate_perceptrons(sizes: list[int]) -> None:
+def test_twin_critics_are_two_separate_perceptrons(sizes: list[int], layer_norm: bool) -> None:
     torch.manual_seed(0)
-    critics = Critics(sizes[0], sizes[1:])
+    critics = Critics(sizes[0], sizes[1:], layer_norm=layer_norm)
     inputs = torch.randn(11, 7, requires_grad=True)
     values = critics(inputs)
     expected = torch.stack(
@@ -62,6 +63,19 @@ def test_twin_critics_are_two_separate_perceptrons(sizes: list[int]) -> None:
     (reference,) = torch.autograd.grad(expected.square().sum(), inputs)
     torch.testing.assert_close(gradient, reference)
     assert not torch.allclose(values[0], values[1])
+
+
+def test_layer_norm_limits_a_networks_outputs_for_any_input() -> None:
+    """At most the last layer's weights times sqrt(H), whatever the input (RLPD, section 4.2)."""
+    torch.manual_seed(0)
+    network, inputs = Perceptron(7, [16, 9], 1, layer_norm=True), torch.randn(20, 7)
+    last = next(layer for layer in reversed(network) if isinstance(layer, nn.Linear))
+    bound = float(last.weight.detach().norm()) * 3 + float(last.bias.detach().abs())
+    for scale in (1.0, 1e3, 1e6):
+        outputs = network(inputs * scale)
+        assert float(outputs.detach().abs().max()) <= bound
+        copy = torch.from_numpy(network.in_numpy()((inputs * scale).numpy()))
+        torch.testing.assert_close(copy, outputs.detach())
 
 
 def test_frozen_critics_pass_gradients_to_their_inputs_only() -> None:
