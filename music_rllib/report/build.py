@@ -28,13 +28,13 @@ from music_rllib.report.figures.choice import (
 from music_rllib.report.figures.draw import files
 from music_rllib.report.figures.plots import METRICS
 from music_rllib.report.page import SweepReport, render
-from music_rllib.report.tables import performance_tables, runs_table, study_files
 from music_rllib.report.two_sweeps import difference_tables
 from music_rllib.report.videos import Videos, make_videos
 from music_rllib.results.analysis import StageAnalysis, analyse
 from music_rllib.results.data import ReportError, Sweep
 from music_rllib.results.statistics import Array
 from music_rllib.results.study import study_of
+from music_rllib.results.tables import performance_tables, runs_table, study_files
 
 PAGE = "report.html"
 PICTURE = "overview"

@@ -10,11 +10,11 @@ import numpy as np
 
 from music_rllib import names
 from music_rllib.report.figures.choice import Drawing, Facets
-from music_rllib.report.table import to_csv
 from music_rllib.results.analysis import Curve
 from music_rllib.results.conditions import SIDE_BY_SIDE
 from music_rllib.results.data import Sweep
 from music_rllib.results.statistics import SHOW_SEEDS_BELOW, Array
+from music_rllib.results.table import to_csv
 
 EPOCH = 80_000
 """Environment steps of an epoch in the original MUSIC: 16 workers x 2 rollouts x 50 cycles x 50."""

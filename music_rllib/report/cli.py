@@ -267,7 +267,7 @@ def _attach(source: SweepRead, folder: Path, made: SweepReport) -> None:
 
 def _note(answer: str, made: SweepReport, run_id: str) -> str:
     """The answer, the last stage's final values and a figure, in Markdown for MLflow's page."""
-    from music_rllib.report.tables import performance_tables
+    from music_rllib.results.tables import performance_tables
 
     lines = [f"**{_escaped(answer)}**", ""]
     last = ""

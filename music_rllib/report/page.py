@@ -19,8 +19,14 @@ from music_rllib import names
 from music_rllib.report.charts import chart_data
 from music_rllib.report.figures.choice import COST, GROUPS, PERFORMANCE, PRIMARY, Drawing, slug
 from music_rllib.report.figures.draw import inline
-from music_rllib.report.table import DASH, Table
-from music_rllib.report.tables import (
+from music_rllib.report.videos import Videos
+from music_rllib.results.analysis import StageAnalysis
+from music_rllib.results.answer import answer, planned_in_words
+from music_rllib.results.conditions import SIDE_BY_SIDE, StageRuns
+from music_rllib.results.data import Sweep
+from music_rllib.results.study import Study
+from music_rllib.results.table import DASH, Table
+from music_rllib.results.tables import (
     budget_table,
     failures_table,
     origin_table,
@@ -31,12 +37,6 @@ from music_rllib.report.tables import (
     state_in_words,
     study_tables,
 )
-from music_rllib.report.videos import Videos
-from music_rllib.results.analysis import StageAnalysis
-from music_rllib.results.answer import answer, planned_in_words
-from music_rllib.results.conditions import SIDE_BY_SIDE, StageRuns
-from music_rllib.results.data import Sweep
-from music_rllib.results.study import Study
 
 # The page may fetch nothing and run only its own script, whatever text a sweep puts into it.
 # Styles cannot be restricted by a hash: Matplotlib's SVGs have style attributes.

@@ -149,11 +149,18 @@ class StageAnalysis:
 
 def analyse(sweep: Sweep) -> list[StageAnalysis]:
     """Compute the statistics of each stage."""
-    return [_analyse(sweep, stage) for stage in find_stages(sweep)]
+    return [analyse_stage(sweep, stage) for stage in find_stages(sweep)]
 
 
-def _analyse(sweep: Sweep, stage: StageRuns) -> StageAnalysis:
-    scopes = stage_scopes(sweep, stage)
+def analyse_stage(sweep: Sweep, stage: StageRuns, metric: str | None = None) -> StageAnalysis:
+    """Compute the statistics of one stage, with the final values of `metric`.
+
+    Args:
+        sweep: The runs.
+        stage: The stage.
+        metric: The metric of final values; None: each task's primary one.
+    """
+    scopes = stage_scopes(sweep, stage, metric)
     rated = [task for task in stage.tasks if sweep.primary_metric(task) == names.EVAL_SUCCESS]
     times = (
         time_to_threshold(sweep, condition, task, threshold)

@@ -312,11 +312,6 @@ def claim_rows(study: Study) -> list[dict[str, Any]]:
             "verdict": str(claim.verdict),
             "why": claim.why,
             "collapses_not_excluded": claim.collapses,
-            "in_words": [
-                verdict_in_words(claim) + not_excluded(claim),
-                interval_in_words(claim),
-                p_in_words(claim),
-            ],
             "planned": claim.planned,
             "hypothesis": claim.hypothesis.text if claim.hypothesis else None,
             "as_expected": claim.confirmed,

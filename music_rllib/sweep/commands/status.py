@@ -165,11 +165,10 @@ mean over the budget), paired by seed if conditions share seeds: superior,
 worse, equivalent within a margin, or undecided (docs/comparing_q.md).
 Comparisons that the sweep's 'analysis' planned before the runs are marked.
 
-Tables of final values follow, without a test: the mean over the seeds that
-have finished on every task with its 95% CI (docs/reports.md), the difference
-from the best mean, and the probability that a run of the best condition ends
-better. Runs on fresh seeds of a search are never mixed with the runs of its
-trials. The report has the same numbers.
+Tables of final values and entropies follow, without a test: the mean over the
+seeds that have finished on every task with its 95% CI (docs/reports.md). Runs
+on fresh seeds of a search are never mixed with the runs of its trials. The
+report has the same tables, and the differences of final values.
 """
 
 
@@ -193,11 +192,11 @@ def compare(
 ) -> int:
     """Compare values of q, or of other settings, with 95% confidence intervals."""
     from music_rllib.experiment.sweep_files import find_sweep
-    from music_rllib.sweep.views.compare import compare_document, compare_view
+    from music_rllib.sweep.views.compare import compare_stage
 
-    document = compare_document(find_sweep(sweep, storage), stage, metric, minimize=minimize)
+    compared = compare_stage(find_sweep(sweep, storage), stage, metric, minimize=minimize)
     if json:
-        print_json(document)
+        print_json(compared.document())
     else:
-        console_for().print(compare_view(document))
+        console_for().print(compared.view())
     return 0

@@ -16,7 +16,8 @@ from music_rllib.envs.tasks import Task
 from music_rllib.experiment.plan import Plan, short
 from music_rllib.experiment.scheduler import Status
 from music_rllib.names import ShortLabels
-from music_rllib.results.statistics import with_interval
+from music_rllib.results.table import Table as DataTable
+from music_rllib.results.tables import search_in_words, search_tables
 from music_rllib.search.best import best_text
 from music_rllib.store.history import RunResult
 from music_rllib.store.node_store import TRAIN_AGAIN
@@ -63,84 +64,25 @@ def _metric_columns(primary: Set[str]) -> dict[str, str]:
     return of_return if primary == of_return.keys() else of_success | of_return
 
 
-def search_views(searches: Iterable[Mapping[str, Any]]) -> list[RenderableType]:
+def search_views(searches: Iterable[Mapping[str, Any]]) -> Iterator[RenderableType]:
     """Tables of trials, the importance of settings, and the final ranking of searches."""
-    views: list[RenderableType] = []
     for search in searches:
+        yield Text(f"Search of stage {search['stage']}: {search_in_words(search)}")
         for arm in search["arms"]:
-            views.append(_trials_table(search, arm))
-            if arm["importance"]:
-                shares = [f"{name} {percent(share)}" for name, share in arm["importance"].items()]
-                views.append(Text(f"Share of the variance explained (fANOVA): {', '.join(shares)}"))
-        if search["ranking"]:
-            views.append(_ranking_table(search))
-    return views
+            if arm["front"]:
+                yield Text(f"Trials of the Pareto front: {', '.join(map(str, arm['front']))}")
+        for table in reversed(list(search_tables(search))):
+            if table.rows:
+                yield console_table(table)
 
 
-def _trials_table(search: Mapping[str, Any], arm: Mapping[str, Any]) -> Table:
-    fixed = ", ".join(f"{name} = {short(value, name)}" for name, value in arm["values"].items())
-    title = (
-        f"Trials of {search['stage']}{f' with {fixed}' if fixed else ''}: "
-        f"{arm['judged']} scored, {arm['pruned']} stopped early, {arm['failed']} failed"
-    )
-    if arm["front"]:
-        title += "; the Pareto front in bold"
-    settings = dict.fromkeys(
-        name for trial in arm["trials"] for name in trial["values"] if name not in arm["values"]
-    )
-    objectives = [objective["name"] for objective in search["objectives"]]
-    heads = ("trial", *settings, *objectives, "state", "why")
-    table = new_table(title, heads, left=("state", "why"))
-    for trial in arm["trials"]:
-        if trial["state"] == "waiting":
-            continue
-        values = trial["objective"] or [None] * len(objectives)
-        intervals = trial.get("interval") or [None] * len(values)
-        best = trial["number"] in (arm["best"], *arm["front"])
-        table.add_row(
-            str(trial["number"]),
-            *setting_cells(settings, trial["values"]),
-            *(with_interval(v, i) for v, i in zip(values, intervals, strict=True)),
-            trial["state"],
-            trial["reason"] or "",
-            style={"failed": "red", "pruned": "dim"}.get(trial["state"], "bold" if best else None),
-        )
-    return table
-
-
-def _ranking_table(search: Mapping[str, Any]) -> Table:
-    """The final ranking on fresh seeds."""
-    settings = dict.fromkeys(name for row in search["ranking"] for name in row["values"])
-    objectives = [
-        head
-        for objective in search["objectives"]
-        for head in (f"{objective['name']}\non fresh seeds, 95% CI", "in the\nsearch")
-    ]
-    table = new_table(
-        f"Ranking of {search['stage']} on fresh seeds. The values 'in the search' are biased "
-        "upwards by the choice of the trials",
-        ("rank", "trial", *settings, *objectives, "P(best is\nbetter)"),
-    )
-    for rank, row in enumerate(search["ranking"], 1):
-        values = setting_cells(settings, row["values"])
-        if "failure" in row:
-            table.add_row("-", str(row["trial"]), *values, row["failure"], style="red")
-            continue
-        numbers = [
-            text
-            for fresh, ends, searched in zip(
-                row["fresh"], row["interval"], row["searched"], strict=True
-            )
-            for text in (with_interval(fresh, ends), f"{searched:.3g}")
-        ]
-        chance = percent(row.get("best_is_better_with"))
-        table.add_row(str(rank), str(row["trial"]), *values, *numbers, chance)
-    return table
-
-
-def setting_cells(settings: Iterable[str], values: Mapping[str, Any]) -> list[str]:
-    """A cell for each setting: its value, or `-` if it has none."""
-    return [short(values[name], name) if name in values else "-" for name in settings]
+def console_table(table: DataTable) -> Table:
+    """A table of the report for the console."""
+    left = [head for head, kind in table.heads if kind != "number"]
+    shown = new_table(table.title, [head for head, _ in table.heads], left)
+    for row in table.cells:
+        shown.add_row(*(cell.text for cell in row))
+    return shown
 
 
 def measured(metric: str, value: float | None) -> str:

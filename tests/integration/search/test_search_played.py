@@ -32,6 +32,9 @@ from music_rllib.experiment import sweep_files
 from music_rllib.experiment.record import changes_since, keep_record
 from music_rllib.experiment.scheduler import Status
 from music_rllib.program import main
+from music_rllib.results.analysis import stage_scopes
+from music_rllib.results.conditions import find_stages
+from music_rllib.results.read import read_sweep
 from music_rllib.search.outcome import outcome
 from music_rllib.search.searches import warm_starts
 from music_rllib.store.storage import StorageError
@@ -641,8 +644,8 @@ def test_two_sweeps_that_share_a_study_list_all_trials(
         place = str(driver.sweep.folder)
         state = answered(capsys, "status", place)
         assert state["stages"][1]["trials"] == 8
-        (group,) = answered(capsys, "compare", place)["groups"]
-        assert sum(row["runs"] for row in group["conditions"]) == 8 * 3
+        (scope,) = stage_scopes(sweep := read_sweep(place).sweep, find_stages(sweep)[-1])
+        assert sum(final.runs for final in scope.finals) == 8 * 3
         trials = json.loads((driver.sweep.folder / "plan.json").read_text())["trials"]
         assert len(trials) == len({json.dumps(trial) for trial in trials})
 

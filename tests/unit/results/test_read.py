@@ -21,10 +21,10 @@ from music_rllib.experiment.record import keep_record
 from music_rllib.experiment.scheduler import Failure
 from music_rllib.program import main
 from music_rllib.report.build import limitations
-from music_rllib.report.tables import failures_table
 from music_rllib.results.analysis import analyse
 from music_rllib.results.read import read_sweep
 from music_rllib.results.study import study_of
+from music_rllib.results.tables import failures_table
 from music_rllib.store.history import HISTORY, Report, RunResult, last_values, to_json_lines
 from music_rllib.store.storage import DamagedError
 from music_rllib.sweep.listeners.state_file import StateFile
@@ -135,11 +135,11 @@ class Shown:
 
     def agreed(self) -> dict[str, tuple[int, float]]:
         """Number of runs and mean of each condition, after checking that all outputs agree."""
-        (group,) = self.compared["groups"]
-        found = {row["label"]: (row["runs"], row["value"]) for row in group["conditions"]}
         (analysis,) = analyse(self.read)
         finals = analysis.scopes[0].finals
-        assert {one.condition.label: (one.runs, one.value) for one in finals} == found
+        found = {one.condition.label: (one.runs, one.value) for one in finals}
+        compared = {row["condition"]: row["seeds"] for row in self.compared["conditions"]}
+        assert compared == {label: runs for label, (runs, _) in found.items()}
         rows = self.frames.conditions
         means = zip(rows["condition"], rows["runs"], rows["mean"], strict=True)
         assert {label: (runs, mean) for label, runs, mean in means} == found

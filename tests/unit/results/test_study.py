@@ -12,13 +12,13 @@ import pytest
 from music_rllib import names
 from music_rllib.report.figures.choice import study_drawings
 from music_rllib.report.figures.draw import files
-from music_rllib.report.tables import study_tables
 from music_rllib.results.analysis_plan import AnalysisPlan, PlanVersion, checked_plans, with_plan
 from music_rllib.results.analysis_plan import as_document as plans_as_document
 from music_rllib.results.answer import answer, seeds_needed
 from music_rllib.results.claims import Verdict
 from music_rllib.results.data import Points, RunRecord, Sweep, columns
 from music_rllib.results.study import Study, alpha_lines, study_of
+from music_rllib.results.tables import study_tables
 
 BUDGET = 10_000
 STEPS = np.arange(1000, BUDGET + 1, 1000)

@@ -32,6 +32,7 @@ from music_rllib.results.analysis import analyse
 from music_rllib.results.answer import answer, claim_rows, mean_rows
 from music_rllib.results.read import read_sweep
 from music_rllib.results.study import study_of
+from music_rllib.results.tables import performance_tables
 from music_rllib.store import node_store
 from music_rllib.store import storage as storage_module
 from music_rllib.store.handoff import write_handoff
@@ -165,19 +166,12 @@ def test_status_and_compare(storage: str, tmp_path: Path, program: Program) -> N
     shown = program("status", "mine", "--storage", storage).output
     assert "Sweep mine: finished" in shown
     assert "Best so far: train q = 1.5: success 0.82 [" in shown
-    (group,) = program("compare", place, "--json").document["groups"]
-    first, *others = group["conditions"]
-    assert first["values"] == {"tac.entropic_index": 1.5}
-    assert first["value"] == pytest.approx(0.82)
-    assert [row["best_is_better_with"] for row in others] == [1.0, 1.0]
-    assert first["seeds"] == pytest.approx([0.8, 0.82, 0.84])
-    assert others[0]["gap"] == pytest.approx(0.5)
-    assert others[0]["gap_interval"][0] < 0.5 < others[0]["gap_interval"][1]
-    assert first["entropies"][names.SHANNON_ENTROPY]["value"] == pytest.approx(0.5 - 0.82)
-    assert first["entropies"][names.ENTROPY]["interval"][0] < 0.25 - 0.82
+    best = program("compare", place, "--json").document["conditions"][1]
+    assert (best["condition"], best["value"]) == ("q = 1.5", pytest.approx(0.82))
     text = program("compare", place).output
-    assert "0.8 0.82 0.84" in text
-    assert "Entropy of the policies at the end on FetchPush" in text
+    assert "0.80 0.82 0.84" in text
+    assert "Final entropies of the policies" in text
+    assert "-0.32" in text
     assert "3 runs, entropy -0.32 nats" in in_one_line(program("status", place).output)
     bad = program("compare", place, "--metric", "nonsense")
     assert (bad.code, "--metric must be one of" in bad.errors) == (2, True)
@@ -202,46 +196,25 @@ def test_compare_and_the_report_say_the_same_of_the_same_sweep(
                 height = HEIGHTS[q] + 0.15 * (task == "FetchPush") + 0.01 * node.run.seed
                 finish(sweep, state_file, node, height, tmp_path / "made")
         state_file.end("stopped")
-    groups = program("compare", f"{storage}/mine", "--json").document["groups"]
     logged = read_sweep(f"{storage}/mine").sweep
-    (analysis,) = analyse(logged)
-    assert [group["tasks"] for group in groups] == ["all tasks", *tasks]
-    for group, scope in zip(groups, analysis.scopes, strict=True):
-        assert group["metric"] == scope.metric
-        rows = {f"q = {row['values']['tac.entropic_index']:g}": row for row in group["conditions"]}
-        best = f"q = {group['conditions'][0]['values']['tac.entropic_index']:g}"
-        for final in scope.finals:
-            row = rows[final.condition.label]
-            assert (row["value"], row["runs"]) == (final.value, final.runs)
-            assert row["interval"] == [final.estimate.lower, final.estimate.upper]
-            assert row["seeds"] == final.scores.mean(axis=1).tolist()
-        for pair in scope.differences:
-            labels = (pair.first.condition.label, pair.second.condition.label)
-            if best not in labels:
-                continue
-            (row,) = [rows[label] for label in labels if label != best]
-            chance = pair.improvement
-            assert row["best_is_better_with"] == (chance if labels[0] == best else 1 - chance)
-            assert abs(row["gap"]) == pytest.approx(abs(float(pair.gap.value)))
-    # What is claimed, too, from the same curves.
+    text = program("compare", f"{storage}/mine").output
+    finals, *_ = performance_tables(analyse(logged))
+    # Seeds that have finished on one of two tasks count there, and not over both.
+    assert [row[-1] for row in finals.rows] == [12, 8, 10, 6, 5, 5, 6, 5, 6]
+    for row in finals.cells:
+        assert " ".join(cell.text for cell in row) in in_one_line(text)
     document = program("compare", f"{storage}/mine", "--json").document
     study = study_of(logged)
     assert document["comparisons"] == json.loads(as_json(claim_rows(study)))
     assert document["conditions"][0]["by_seed"] == mean_rows(study)[0]["by_seed"]
     assert document["answer"] == answer(logged, study)
-    # Seeds that have finished on one of two tasks count there, and not over both.
-    assert [row["runs"] for row in groups[0]["conditions"]] == [8, 10, 12]
-    assert [row["runs"] for row in groups[1]["conditions"]] == [5, 5, 6]
 
 
 def test_compare_has_one_family_of_tests(storage: str, tmp_path: Path, program: Program) -> None:
     played(storage, tmp_path, runs=15, seeds=5)
     document = program("compare", f"{storage}/mine", "--json").document
     assert {row["second"]: row["verdict"] for row in document["comparisons"]}["q = 1.5"] == "worse"
-    (group,) = document["groups"]
-    assert group.keys() == {"part", "tasks", "metric", "conditions"}
-    assert not any("p_value" in row for row in group["conditions"])
-    _, title, finals = program("compare", f"{storage}/mine").output.partition("Final evaluation/")
+    _, title, finals = program("compare", f"{storage}/mine").output.partition("Final values")
     assert title
     assert " p " not in finals, "final values have no column of p-values"
 
@@ -259,11 +232,8 @@ def test_compare_and_best_name_no_first_without_evidence(
 
 def test_compare_counts_unfinished_runs(storage: str, tmp_path: Path, program: Program) -> None:
     played(storage, tmp_path, runs=4)
-    (group,) = program("compare", f"{storage}/mine", "--json").document["groups"]
-    assert sorted(row["runs"] for row in group["conditions"]) == [1, 3]
-    text = program("compare", f"{storage}/mine").output
-    assert "3 of 3" in text
-    assert "1 of 3" in text
+    rows = program("compare", f"{storage}/mine", "--json").document["conditions"]
+    assert [(row["seeds"], row["runs"]) for row in rows] == [(3, 3), (1, 3)]
 
 
 @IN_A_BUCKET
@@ -370,7 +340,6 @@ def test_tasks_without_success_are_judged_by_their_return(
     place = f"{storage}/mine"
     document = program("compare", place, "--json").document
     assert document["metric"] == names.EVAL_RETURN
-    assert document["groups"][0]["conditions"][0]["values"] == {"tac.entropic_index": 1.0}
     chosen = program("best", place, "--output", "out", "--json").document
     assert chosen["values"] == {"tac.entropic_index": 1.0}
     assert (chosen["metric"], chosen["value"]) == (names.EVAL_RETURN, pytest.approx(-0.2))
@@ -701,7 +670,7 @@ def test_a_file_uri_names_one_folder(tmp_path: Path, program: Program) -> None:
     played(f"file://{tmp_path}/a%20b", tmp_path)
     assert [path.name for path in tmp_path.glob("a*")] == ["a b"]
     for place in (f"file://{tmp_path}/a%20b/mine", f"{tmp_path}/a b/mine"):
-        assert program("compare", place, "--json").document["groups"]
+        assert program("compare", place, "--json").document["conditions"]
 
 
 def test_an_analysis_plan_is_recorded_and_changes_no_run(

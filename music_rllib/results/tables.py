@@ -9,16 +9,6 @@ from typing import Any
 import numpy as np
 
 from music_rllib import names
-from music_rllib.report.table import (
-    DASH,
-    Code,
-    Difference,
-    Seconds,
-    Share,
-    Table,
-    estimate_of,
-    to_csv,
-)
 from music_rllib.results.analysis import StageAnalysis
 from music_rllib.results.answer import (
     claim_rows,
@@ -31,6 +21,16 @@ from music_rllib.results.answer import (
 from music_rllib.results.data import Sweep
 from music_rllib.results.statistics import FEWEST_FOR_INTERVAL, SHOW_SEEDS_BELOW, Estimate
 from music_rllib.results.study import Study
+from music_rllib.results.table import (
+    DASH,
+    Code,
+    Difference,
+    Seconds,
+    Share,
+    Table,
+    estimate_of,
+    to_csv,
+)
 
 UNFOLDED_ROWS = 30
 """Largest number of trials that the page shows unfolded."""
