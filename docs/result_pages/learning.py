@@ -15,8 +15,7 @@ from docs.result_pages.totals import steps_before
 from music_rllib import names
 from music_rllib.report.figures.choice import Drawing
 from music_rllib.report.figures.draw import files
-from music_rllib.report.figures.palette import Style, styles_of
-from music_rllib.report.figures.plots import METRICS, Subplot, curve_subplot
+from music_rllib.report.figures.plots import METRICS, Style, Subplot, curve_subplot, styles_of
 from music_rllib.results import statistics as st
 from music_rllib.results.analysis import Curve, curve
 from music_rllib.results.conditions import Condition, StageRuns, find_stages

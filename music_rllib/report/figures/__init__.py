@@ -1,1 +1,1 @@
-"""Figures of a report: their selection for a sweep, their panels, colours and files."""
+"""Figures of a report: their choice, subplots, colors and files."""

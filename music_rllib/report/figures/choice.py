@@ -9,18 +9,19 @@ from dataclasses import dataclass, field, replace
 from itertools import groupby, product
 
 from music_rllib import names
-from music_rllib.report.figures.palette import Style, styles_of
 from music_rllib.report.figures.plots import (
     METRICS,
     MOST_BANDS,
     Legend,
     Metric,
+    Style,
     Subplot,
     alpha_subplot,
     curve_subplot,
     entropy_subplot,
     finals_subplot,
     profile_subplot,
+    styles_of,
 )
 from music_rllib.results.analysis import Curve, FinalScores, Scope, StageAnalysis, curve
 from music_rllib.results.conditions import ALPHA, Condition, StageRuns, stages_together
