@@ -22,7 +22,6 @@ from pydantic.fields import FieldInfo
 from pydantic.json_schema import GenerateJsonSchema
 from pydantic_core import core_schema
 
-from music_rllib.config.analysis import Analysis
 from music_rllib.config.document import SCHEMA, shipped_presets
 from music_rllib.config.layers import all_settings
 from music_rllib.config.run_settings import (
@@ -34,6 +33,7 @@ from music_rllib.config.run_settings import (
     RunSettings,
 )
 from music_rllib.config.schema import (
+    Analysis,
     Checkpoints,
     Header,
     InitFrom,

@@ -26,8 +26,8 @@ from typing import Any
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "architecture.md"
-EXPORT = ROOT / "docs/results/data/earlier-fetch-reach"
-MOST_DRIVER_MODULES = 58
+EXPORT = ROOT / "docs/results/data/q-at-equal-pressure"
+MOST_DRIVER_MODULES = 54
 """Largest number of modules of the package that `import music_rllib.sweep.driver` may load."""
 START, END = "## Five journeys\n", "## Where to add something\n"
 _NAME = re.compile(r"`(music_rllib(?:\.\w+)+):(\w+)`|`([A-Z]\w+\.\w+)`")
@@ -133,12 +133,14 @@ def trace_search(called: Called, folder: Path) -> None:
 
 
 def trace_report(called: Called, _: Path) -> None:
-    """The report of an exported sweep."""
+    """The report of an exported sweep with an analysis plan."""
     from music_rllib.report.build import WANTED, build_report
     from music_rllib.results.read import read_sweep
 
+    sweep = read_sweep(str(EXPORT), metrics=WANTED).sweep
+    assert sweep.plans
     with called.recording():
-        build_report(read_sweep(str(EXPORT), metrics=WANTED).sweep)
+        build_report(sweep)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,7 +185,7 @@ JOURNEYS = {
         trace=trace_plan,
         traced=(1, 2, 3, 4, 5),
         example="`music-rllib plan` of the README's sweep",
-        most_files=46,
+        most_files=40,
     ),
     "loss": Journey(
         title="From `entropic_index` to the loss",
@@ -254,9 +256,9 @@ JOURNEYS = {
             "`music_rllib.report.build:write_report` writes the page and the figures",
         ),
         trace=trace_report,
-        traced=(4, 5, 6),
-        example="the report of an export",
-        most_files=18,
+        traced=(5, 6),
+        example="the report of an export with an analysis plan",
+        most_files=14,
     ),
 }
 

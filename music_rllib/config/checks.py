@@ -2,30 +2,20 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from music_rllib import names
-from music_rllib.config.analysis import Analysis, Hypothesis, same_value
 from music_rllib.config.layers import PlacedPoint, is_in
 from music_rllib.config.problems import ConfigError, Findings, KeyPath, shown
 from music_rllib.config.run_settings import RunSettings
-from music_rllib.config.schema import Point, Stage
+from music_rllib.config.schema import Analysis, Hypothesis, Point, Stage, same_value
 from music_rllib.config.search import SearchSettings, of_stage
 from music_rllib.config.space import Choice
 from music_rllib.config.tac_settings import setting_text
 from music_rllib.envs.tasks import closest
 from music_rllib.redaction import flat_params
 
-_METRICS = frozenset(
-    value
-    for key, value in vars(names).items()
-    if key.isupper()
-    and isinstance(value, str)
-    and not value.isupper()  # an environment variable
-    and not key.startswith(("TAG_", "KIND_", "ARTIFACT_", "SETTING_"))
-)
 _OF_SUCCESS = frozenset(
     {names.EVAL_SUCCESS, names.EVAL_SUCCESS_ANY, names.TRAIN_SUCCESS, names.TRAIN_SUCCESS_ANY}
 )
@@ -86,8 +76,16 @@ def _source_of(stage: Stage, earlier: Mapping[str, Stage | None]) -> Stage | Non
 
 def _broken_metric(metric: str, stage: Stage) -> str | None:
     """The rule that an objective's metric breaks; None if each run reports it."""
-    if metric not in _METRICS:
-        hint = closest(metric, _METRICS)
+    known = {
+        value
+        for key, value in vars(names).items()
+        if key.isupper()
+        and isinstance(value, str)
+        and not value.isupper()  # an environment variable
+        and not key.startswith(("TAG_", "KIND_", "ARTIFACT_", "SETTING_"))
+    }
+    if metric not in known:
+        hint = closest(metric, known)
         return f"must be a metric that runs report, got {shown(metric)}{hint}"
     without = [task.name for task in stage.tasks if task.success_key is None]
     if metric in _OF_SUCCESS and without:
@@ -297,36 +295,3 @@ def _broken_final(stage: Stage, condition: Mapping[str, str]) -> str | None:
 
 def _has(run: Settings, condition: Mapping[str, str]) -> bool:
     return all(name in run and same_value(text, run[name]) for name, text in condition.items())
-
-
-def unnamed_differences(
-    analysis: Analysis, stages: Mapping[str, Stage]
-) -> Iterator[tuple[str, list[str]]]:
-    """Hypotheses whose sides differ in settings that they do not name, and these settings.
-
-    Omits α, which the analysis plan describes, and the settings of MUSIC, in which stages of
-    different variants always differ.
-    """
-    default = analysis.stage or list(stages)[-1]
-    for text in analysis.hypotheses:
-        sides = Hypothesis.of(text).sides
-        named = {".".join(key.split(".")[:2]) for side in sides for key in side} | {"tac.alpha"}
-        first, second = (_all_values(stages[side.get("stage", default)], side) for side in sides)
-        differ = {key for key in first if first[key] != second[key]}
-        if unnamed := sorted({".".join(key.split(".")[:2]) for key in differ} - named):
-            yield text, unnamed
-
-
-def _all_values(stage: Stage, condition: Mapping[str, str]) -> Mapping[str, set[str]]:
-    """Dotted setting to the values that it has in the runs of a condition."""
-    settings = {name: text for name, text in condition.items() if name != "stage"}
-    runs: Sequence[Settings] = [
-        _settings(run) for point in stage.points for run in point.runs.values()
-    ]
-    values: defaultdict[str, set[str]] = defaultdict(set)
-    # The stage has no run with a searched setting yet: then all its runs are alike.
-    for run in [run for run in runs if _has(run, settings)] or runs:
-        for name, value in run.items():
-            if name in {"env_steps", "num_envs"} or name.startswith(("tac.", "replay.")):
-                values[name].add(value)
-    return values

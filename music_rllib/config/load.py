@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from music_rllib.config.checks import check_analysis, unnamed_differences
+from music_rllib.config.checks import check_analysis
 from music_rllib.config.document import (
     Document,
     Place,
@@ -24,13 +24,11 @@ from music_rllib.config.document import (
 )
 from music_rllib.config.layers import all_settings
 from music_rllib.config.problems import ConfigError, Findings, shown, unknown
-from music_rllib.config.run_settings import LAYER_KEYS, RunSettings
+from music_rllib.config.run_settings import LAYER_KEYS
 from music_rllib.config.schema import Header, Stage, SweepConfig
 from music_rllib.config.search import FINAL_SEED
 from music_rllib.config.stages import resolve_stage
-from music_rllib.config.tac_settings import Range, cut_off
-from music_rllib.envs.modules import search_in
-from music_rllib.envs.tasks import BUILT_IN_TASKS, Task, TaskRegistry, UnknownTaskError
+from music_rllib.envs.tasks import BUILT_IN_TASKS, Task, TaskRegistry, UnknownTaskError, search_in
 from music_rllib.limits import MOST_RUNS, MOST_SEEDS
 from music_rllib.store.storage import expanded
 
@@ -249,37 +247,9 @@ def _count_runs(stages: Mapping[str, Stage | None], seeds: int, findings: Findin
 
 def warnings_of(config: SweepConfig) -> list[str]:
     """One line for each property of a valid sweep that may be unintended."""
-    places: dict[str, list[str]] = {}
-    for stage in config.stages:
-        for task in stage.tasks:
-            runs = (point.runs[task.name] for _, point in stage.examples())
-            if text := next(filter(None, map(_cut_off_returns, runs)), None):
-                places.setdefault(text, []).append(f"{stage.name}/{task.name}")
-    lines = [f"{', '.join(where)}: {text}" for text, where in places.items()]
-    lines += [
+    return [
         f"{stage.name}: search.trials is {search.trials:,}, and the space has {search.count:,} "
         f"points: the search ends after {search.count:,} trials"
         for stage in config.stages
         if (search := stage.search) is not None and (search.trials or 0) > search.count
     ]
-    if config.analysis is not None:
-        stages = {stage.name: stage for stage in config.stages}
-        lines += [
-            f"analysis: {hypothesis!r} compares runs that also differ in {', '.join(settings)}"
-            for hypothesis, settings in unnamed_differences(config.analysis, stages)
-        ]
-    return lines
-
-
-def _cut_off_returns(run: RunSettings) -> str | None:
-    """The warning about a run's `target_bounds`; None if there is none."""
-    known = run.task.reward_range or (None if run.music.task_reward else (0.0, 0.0))
-    if known is not None:
-        text = cut_off(run.tac, run.music, Range(*known))
-        return text and f"tac.{text}"
-    if run.tac.target_bounds is None:
-        return None
-    return (
-        "tac.target_bounds may cut off reachable values: the rewards of "
-        f"{run.task.name} are not known (environments.{run.task.name}.reward_range)"
-    )

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import json
+import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
 from music_rllib import names
-from music_rllib.config.analysis import Analysis
 from music_rllib.config.problems import ConfigError
 from music_rllib.config.run_settings import RunSettings, Variant
 from music_rllib.config.search import SearchSettings
@@ -86,6 +87,119 @@ class Checkpoints(StrictModel):
     """Largest replay buffer in megabytes with which a finished run keeps its last checkpoint, so
     that the same run with more `env_steps` continues from there; 0: no checkpoint is kept."""
 
+
+# The `analysis` section ---------------------------------------------------------------------------
+
+SETTINGS_IN_SHORT = {
+    "q": "tac.entropic_index",
+    "α": "tac.alpha",
+    "alpha": "tac.alpha",
+    "weight": "music.mi_reward_weight",
+}
+"""Short name of a setting in hypotheses to the setting."""
+_HYPOTHESIS = re.compile(
+    r"(?P<first>.+?) (?P<relation>better than|worse than|equivalent to|against) (?P<second>.+)"
+)
+_NEXT_SETTING = re.compile(r",(?=[^,=]+=)")
+_JSON_FOR_PYTHON = {"True": "true", "False": "false", "None": "null"}
+
+
+class Hypothesis(NamedTuple):
+    """Two conditions and the expected relation between them: `q = 1.5 better than q = 1`."""
+
+    text: str
+    first: Mapping[str, str]
+    """The first condition: dotted setting, or `stage`, to its value."""
+    second: Mapping[str, str]
+    relation: str
+    """`better than`, `worse than`, `equivalent to`, or `against` if nothing is expected."""
+
+    @property
+    def sides(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
+        """Both conditions."""
+        return self.first, self.second
+
+    @classmethod
+    def of(cls, text: str) -> Self:
+        """Parse a hypothesis.
+
+        Raises:
+            ValueError: The text is not a hypothesis; the message has an example.
+        """
+        words = " ".join(text.split())
+        match = _HYPOTHESIS.fullmatch(words)
+        first = _condition(match["first"]) if match else {}
+        second = _condition(match["second"]) if match else {}
+        if match is None or not first or not second or _is_same(first, second):
+            raise ValueError(
+                "must be two different conditions with 'better than', 'worse than', 'equivalent "
+                f"to' or 'against' between them, like 'q = 1.5 against q = 1', got {text!r}"
+            )
+        return cls(text=words, first=first, second=second, relation=match["relation"])
+
+
+def _condition(text: str) -> dict[str, str]:
+    """The settings of `q = 1.5, tac.lr = 0.001`; empty if the text is not such a list."""
+    settings = {}
+    for part in _NEXT_SETTING.split(text):
+        name, _, value = (piece.strip() for piece in part.partition("="))
+        name = SETTINGS_IN_SHORT.get(name, name)
+        if not name or not value or name in settings:
+            return {}
+        settings[name] = value
+    return settings
+
+
+def _canonical(text: str) -> str:
+    """A value of a hypothesis or an MLflow param as JSON: the same for `1` and `1.0`."""
+    with contextlib.suppress(ValueError):
+        return json.dumps(float(text))
+    with contextlib.suppress(ValueError, RecursionError):
+        value = json.loads(_JSON_FOR_PYTHON.get(text, text), parse_int=float)
+        return json.dumps(value, sort_keys=True)
+    return text
+
+
+def _is_same(first: Mapping[str, str], second: Mapping[str, str]) -> bool:
+    """Whether two conditions are equal; the names of stages are text."""
+    return first.keys() == second.keys() and all(
+        text == second[name] if name == "stage" else same_value(text, second[name])
+        for name, text in first.items()
+    )
+
+
+def same_value(one: str, other: str) -> bool:
+    """Whether two texts are the same value, such as `1` and `1.0`, or `true` and `True`."""
+    return one == other or _canonical(one) == _canonical(other)
+
+
+class Analysis(StrictModel):
+    """The questions of a sweep, stated before the runs; no run's result depends on them."""
+
+    question: str | None = Field(None, min_length=1, max_length=500, pattern=r"^[^\x00-\x1f\x7f]*$")
+    """The question in a sentence, for the report's first line."""
+    hypotheses: tuple[
+        Annotated[
+            str, Field(max_length=500), AfterValidator(lambda text: Hypothesis.of(text).text)
+        ],
+        ...,
+    ] = Field(min_length=1, max_length=50)
+    """Two conditions each with `better than`, `worse than`, `equivalent to` or `against` between
+    them: `q = 1.5 better than q = 1`. A condition is all runs with these settings (`q`, `alpha`,
+    `weight`, a dotted setting, `stage`). If more settings vary, differences are averaged over pairs
+    with equal other settings."""
+    stage: str | None = None
+    """Stage of the conditions; null: the last stage. A condition can name another stage."""
+    metric: Literal["auc", "final"] = "auc"
+    """Number to compare: the mean of the task's primary metric over the budget (the area under the
+    learning curve), or its last value."""
+    margin: float | None = Field(None, gt=0)
+    """Margin of equivalence tests: smaller differences do not matter. null: 0.05 for a success
+    rate; required for a return. If tasks of both kinds are compared, a margin of 1 or more applies
+    to returns, and success rates keep 0.05."""
+
+
+# The sweep ----------------------------------------------------------------------------------------
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=80)]
 Seed = Annotated[int, Field(ge=0, lt=2**31)]

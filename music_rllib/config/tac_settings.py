@@ -218,7 +218,7 @@ class TACSettings(StrictModel):
     """Gradient updates between two updates of the target networks."""
     target_bounds: tuple[float, float] | None = None
     """Range to which critic targets are clipped (original MUSIC: plus/minus 4/(1-gamma)). It keeps
-    values from diverging. A sweep prints a warning if the range cuts off reachable values."""
+    values from diverging, and must contain all reachable values."""
     batch_size: int = Field(256, gt=0)
     """Transitions per update. Larger values make updates less noisy and slower."""
     replay_ratio: float = Field(1.0, gt=0)
@@ -318,8 +318,6 @@ def setting_text(
             return f"{float(value):g}"
 
 
-_ROUNDING = 1e-6
-"""-1 / (1 - 0.98) is -49.99999999999996, which [-50, 0] does not cut off."""
 _DIVERGED = 2.0
 """Critic means above this multiple of the reachable return count as diverged. Of 446 runs on Fetch,
 one reached 13.9; all others stayed below 0.97."""
@@ -340,52 +338,6 @@ def reward_of_step(task: Range, music: MusicSettings) -> Range:
     low, high = task if music.task_reward else Range(0.0, 0.0)
     weight = extremes(music.mi_reward_weight)[1] if music.estimator != "none" else 0.0
     return Range(low - weight, high)
-
-
-def cut_off(tac: TACSettings, music: MusicSettings, task: Range) -> str | None:
-    """A warning if `target_bounds` cut off reachable targets.
-
-    The return of an endless episode is a step's reward times 1/(1 - gamma); that of a terminated
-    one is nearer to 0. The target value network also holds the entropies of later steps. These have
-    no lower bound (a policy may be arbitrarily narrow), so they count at the upper end only. They
-    count for one action dimension, because the environment decides on the number.
-    """
-    if tac.target_bounds is None:
-        return None
-    bounds, reward = Range(*tac.target_bounds), reward_of_step(task, music)
-    steps = 1.0 / (1.0 - tac.gamma)
-    bonus = _entropy_bonus(tac) * tac.gamma * steps
-    reached = Range(
-        min(reward.low, reward.low * steps), max(reward.high, reward.high * steps) + bonus
-    )
-    slack = _ROUNDING * max(abs(reached.low), abs(reached.high))
-    if bounds.low <= reached.low + slack and bounds.high >= reached.high - slack:
-        return None
-    entropy = " and the entropy of one action dimension" if bonus > 0 else ""
-    return (
-        f"target_bounds {bounds} cut off reachable values, {reached}: "
-        f"rewards of {reward} a step at gamma {tac.gamma:g}{entropy}"
-    )
-
-
-def _entropy_bonus(tac: TACSettings) -> float:
-    """Largest entropy bonus of a step: alpha times the entropy of one uniform action dimension."""
-    if tac.policy == "deterministic":
-        return 0.0
-    from music_rllib.functional.entropy_scale import largest_entropy  # loads PyTorch
-
-    alpha = tac.alpha
-    bonuses = [0.0]
-    for q in extremes(tac.entropic_index):
-        match alpha:
-            case LearnedAlpha():
-                largest = alpha.initial  # later values are unknown
-            case MatchedAlpha() | NormalisedAlpha():
-                largest = alpha.scaled(extremes(alpha.value)[1], q, 1, "per_dimension")
-            case _:
-                largest = extremes(alpha)[1]
-        bonuses.append(largest * largest_entropy(q))
-    return max(bonuses)
 
 
 def have_diverged(

@@ -36,8 +36,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from music_rllib.envs.modules import is_installed, make_importable, register_robotics
-from music_rllib.envs.tasks import BUILT_IN_TASKS
+from music_rllib.envs.tasks import BUILT_IN_TASKS, is_installed, make_importable, register_robotics
 
 Fingerprint = Mapping[str, str]
 

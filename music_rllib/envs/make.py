@@ -14,8 +14,13 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from music_rllib.envs.episodes import Recording, lost_by_rounding, random_offsets
-from music_rllib.envs.modules import make_importable, register_robotics
-from music_rllib.envs.tasks import BUILT_IN_TASKS, LAST_SEED, Task
+from music_rllib.envs.tasks import (
+    BUILT_IN_TASKS,
+    LAST_SEED,
+    Task,
+    make_importable,
+    register_robotics,
+)
 from music_rllib.envs.values import (
     BadNumberError,
     are_usable,
@@ -39,7 +44,7 @@ def make_env(env_id: str, **kwargs: Any) -> Env:
 
     Raises:
         gymnasium.error.Error: The id or an argument is unknown.
-        ImportError: The module in front of the id is not found (`music_rllib.envs.modules`).
+        ImportError: The module in front of the id is not found (`music_rllib.envs.tasks`).
     """
     register_robotics()
     if ":" in env_id:

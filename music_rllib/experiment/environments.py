@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from music_rllib.envs.fingerprint import Fingerprint, digest_of
@@ -210,25 +210,3 @@ def accept_environments(
     storage.write(SAME_ENVIRONMENTS, as_json(document).encode())
     kept = (*sweep.environments.kept, *answers)
     return replace(sweep, environments=replace(sweep.environments, kept=kept))
-
-
-def mixed(runs: Iterable[tuple[str, str, str]]) -> Iterator[str]:
-    """A line for each task whose runs used several versions of its environment.
-
-    Args:
-        runs: Task, label and environment's digest of each run; "" if that was not recorded.
-    """
-    tasks: dict[str, dict[str, list[str]]] = {}
-    for task, label, digest in runs:
-        if digest:
-            tasks.setdefault(task, {}).setdefault(digest, []).append(label)
-    for task, groups in tasks.items():
-        if len(groups) > 1:
-            parts = (
-                f"{', '.join(labels[:SHOWN])}{' ...' if len(labels) > SHOWN else ''} ({digest[:6]})"
-                for digest, labels in groups.items()
-            )
-            yield (
-                f"Runs on {task} are compared that used {len(groups)} versions of its environment: "
-                f"{'; '.join(parts)}."
-            )

@@ -15,7 +15,6 @@ import numpy as np
 from music_rllib import names
 from music_rllib.config.tac_settings import Range, have_diverged
 from music_rllib.envs.tasks import Task
-from music_rllib.experiment.environments import mixed
 from music_rllib.names import ShortLabels, in_runs
 from music_rllib.report.charts import curves_csv
 from music_rllib.report.figures.choice import (
@@ -30,7 +29,7 @@ from music_rllib.report.figures.plots import METRICS
 from music_rllib.report.page import SweepReport, render
 from music_rllib.report.two_sweeps import difference_tables
 from music_rllib.report.videos import Videos, make_videos
-from music_rllib.results.analysis import StageAnalysis, analyse
+from music_rllib.results.analysis import StageAnalysis, analyse, mixed
 from music_rllib.results.data import ReportError, Sweep
 from music_rllib.results.statistics import Array
 from music_rllib.results.study import study_of

@@ -7,7 +7,7 @@ evaluations of every run; a run that failed or is still running is censored at i
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from typing import NamedTuple
@@ -286,3 +286,29 @@ def curve(sweep: Sweep, condition: Condition, task: str, metric: str) -> Curve |
         estimate=st.estimate(values[:, np.newaxis], episodes),
         runs=np.sum(~np.isnan(values), axis=0),
     )
+
+
+_SHOWN = 10
+"""Largest number of runs in a sentence."""
+
+
+def mixed(runs: Iterable[tuple[str, str, str]]) -> Iterator[str]:
+    """A line for each task whose runs used several versions of its environment.
+
+    Args:
+        runs: Task, label and environment's digest of each run; "" if that was not recorded.
+    """
+    tasks: dict[str, dict[str, list[str]]] = {}
+    for task, label, digest in runs:
+        if digest:
+            tasks.setdefault(task, {}).setdefault(digest, []).append(label)
+    for task, groups in tasks.items():
+        if len(groups) > 1:
+            parts = (
+                f"{', '.join(runs_of[:_SHOWN])}{' ...' * (len(runs_of) > _SHOWN)} ({digest[:6]})"
+                for digest, runs_of in groups.items()
+            )
+            yield (
+                f"Runs on {task} are compared that used {len(groups)} versions of its environment: "
+                f"{'; '.join(parts)}."
+            )

@@ -21,8 +21,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, model_validator
 
 from music_rllib import names
-from music_rllib.config.analysis import Hypothesis
-from music_rllib.config.schema import Stage, SweepConfig
+from music_rllib.config.schema import Hypothesis, Stage, SweepConfig
 from music_rllib.config.tac_settings import setting_text
 from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.sweep_files import ANALYSIS_PLAN, SweepLocation, as_json

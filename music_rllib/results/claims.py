@@ -21,7 +21,7 @@ import numpy as np
 from scipy import stats
 
 from music_rllib import names
-from music_rllib.config.analysis import Hypothesis
+from music_rllib.config.schema import Hypothesis
 from music_rllib.results.analysis_plan import MARGIN_OF_A_RATE
 from music_rllib.results.conditions import ALL_TASKS, Condition
 from music_rllib.results.data import Sweep

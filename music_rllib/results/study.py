@@ -15,7 +15,7 @@ from itertools import combinations
 
 import numpy as np
 
-from music_rllib.config.analysis import Hypothesis, same_value
+from music_rllib.config.schema import Hypothesis, same_value
 from music_rllib.results import statistics as st
 from music_rllib.results.analysis_plan import PlanVersion
 from music_rllib.results.claims import Claim, Pairs, claims_of, decided, exploratory

@@ -15,7 +15,6 @@ import warnings
 from functools import partial
 from pathlib import Path
 
-from music_rllib.envs.modules import drop_farama_notice
 from music_rllib.runtime.machine import cluster_address
 
 # Logger -> beginnings of expected messages at WARNING level about this package's use of a library.
@@ -102,4 +101,3 @@ def quiet_third_parties() -> None:
     warnings.filterwarnings(
         "ignore", message=r".*Overriding environment rllib-(single|multi)-agent-env-v0"
     )
-    drop_farama_notice()

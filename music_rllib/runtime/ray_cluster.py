@@ -17,7 +17,7 @@ import psutil
 import ray
 
 from music_rllib.config.schema import Resources
-from music_rllib.envs.modules import folders_for_workers, search_in
+from music_rllib.envs.tasks import folders_for_workers, search_in
 from music_rllib.errors import first_line
 from music_rllib.runtime.machine import (
     RAY_FOLDER,

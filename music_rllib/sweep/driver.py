@@ -18,9 +18,8 @@ from rich.console import Console
 from music_rllib.command_line import console_for, how_to_continue, print_json
 from music_rllib.config.load import load_sweep, warnings_of
 from music_rllib.config.schema import MlflowSettings, SweepConfig
-from music_rllib.envs.modules import search_in
+from music_rllib.envs.tasks import search_in
 from music_rllib.errors import BadInputError
-from music_rllib.experiment.demand import check_demand
 from music_rllib.experiment.environments import (
     accept_environments,
     changed_text,
@@ -42,6 +41,7 @@ from music_rllib.runtime.machine import (
 from music_rllib.runtime.process import early
 from music_rllib.store.storage import check_storage, is_remote, resolve_storage
 from music_rllib.sweep import preflight
+from music_rllib.sweep.preflight import check_demand
 from music_rllib.sweep.views.plan import plan_answer, plan_view
 
 DEFAULT_CONFIG = Path(__file__).with_name("default.yaml")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Self, TypeVar
 
@@ -14,8 +13,8 @@ from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 
 from music_rllib.config.problems import problems_of
 from music_rllib.config.run_settings import ReplaySettings
-from music_rllib.config.tac_settings import Range, TACSettings, cut_off
-from music_rllib.envs.tasks import BUILT_IN_TASKS, LAST_SEED, Indices, check_split
+from music_rllib.config.tac_settings import TACSettings
+from music_rllib.envs.tasks import LAST_SEED, Indices, check_split
 from music_rllib.intrinsic.interface import IntrinsicReward
 from music_rllib.intrinsic.music import Music
 from music_rllib.intrinsic.settings import MusicSettings
@@ -66,7 +65,6 @@ class TACConfigBase(AlgorithmConfig):
                 setattr(self, prefix + name, field.default)
         self.total_env_steps: int | None = None
         self.torch_threads = 1
-        self.reward_range: tuple[float, float] | None = None
         self.seed_range: tuple[int, int] = (0, LAST_SEED)
         self.success_key: str | None = "is_success"
         # Success of a step whose info lacks the key; None leaves the step out of success rates.
@@ -94,15 +92,12 @@ class TACConfigBase(AlgorithmConfig):
         *,
         total_env_steps: int | None = NotProvided,
         torch_threads: int = NotProvided,
-        reward_range: tuple[float, float] | None = NotProvided,
         **settings: Any,
     ) -> Self:
         """Set TAC's hyperparameters.
 
         Args:
             total_env_steps: budget of the run, of which `linear` schedules are fractions.
-            reward_range: smallest and largest reward of the environment, if they are known:
-                `validate()` then warns if `target_bounds` cut off reachable values.
             torch_threads: threads of the Learner's process. More than one gains nothing on
                 networks of this size, and changes results in the last digits.
             **settings: fields of `TACSettings`, or arguments of `AlgorithmConfig.training`.
@@ -117,7 +112,6 @@ class TACConfigBase(AlgorithmConfig):
             tac,
             total_env_steps=total_env_steps,
             torch_threads=torch_threads,
-            reward_range=reward_range,
         )
 
     def music(
@@ -271,9 +265,6 @@ class TACConfigBase(AlgorithmConfig):
                 "MUSIC needs to know the agent's and the surrounding state: set "
                 "music(agent_indices=[...], surrounding_indices=[...])"
             )
-        task = self._reward_of_step()
-        if task is not None and (warning := cut_off(tac, music, task)):
-            warnings.warn(warning, stacklevel=2)
 
     def _check_adaptive(self, tac: TACSettings, music: MusicSettings) -> None:
         adaptive = {
@@ -289,14 +280,6 @@ class TACConfigBase(AlgorithmConfig):
                     f"{name}.follows: success_rate needs evaluations: set "
                     "evaluation(evaluation_interval=...)"
                 )
-
-    def _reward_of_step(self) -> Range | None:
-        """The range of a step's reward, set or that of a built-in task; None: unknown."""
-        reward_range = self.reward_range
-        if reward_range is None and not self.env_config:
-            built_in = (t.reward_range for t in BUILT_IN_TASKS.values() if t.env_id == self.env)
-            reward_range = next(built_in, None)
-        return None if reward_range is None else Range(*reward_range)
 
     # -- defaults for RLlib ---------------------------------------------------------------
 

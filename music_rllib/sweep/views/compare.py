@@ -10,10 +10,9 @@ from rich.text import Text
 
 from music_rllib import names
 from music_rllib.errors import BadInputError
-from music_rllib.experiment.environments import mixed
 from music_rllib.experiment.sweep_files import SweepLocation
 from music_rllib.names import ShortLabels
-from music_rllib.results.analysis import StageAnalysis, analyse_stage
+from music_rllib.results.analysis import StageAnalysis, analyse_stage, mixed
 from music_rllib.results.answer import answer, study_data
 from music_rllib.results.conditions import find_stages
 from music_rllib.results.data import Sweep

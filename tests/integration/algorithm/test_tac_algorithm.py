@@ -264,7 +264,6 @@ def test_every_setting_is_listed() -> None:
     assert fields == set(CHANGES)
 
 
-@pytest.mark.filterwarnings("ignore:target_bounds -1 to 0 cut off")
 @pytest.mark.parametrize("setting", CHANGES)
 def test_no_setting_is_dead(setting: str, bases: dict[str, dict[str, float]]) -> None:
     value, base = CHANGES[setting]
@@ -521,26 +520,6 @@ def test_a_bad_setting_is_refused(settings: dict[str, Any], message: str) -> Non
 def test_contradictory_settings_are_refused(make: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make(TACConfig().environment("Pendulum-v1")).validate()
-
-
-@pytest.mark.parametrize(
-    ("make", "said"),
-    [
-        (lambda c: c.environment("FetchPush-v4"), "-100 to"),
-        (lambda c: c.environment("FetchPush-v4", env_config={"reward_type": "dense"}), None),
-        (lambda c: c.environment("Pendulum-v1"), None),
-        (lambda c: c.environment("Pendulum-v1").training(reward_range=(-17.0, 0.0)), "-1700 to"),
-        (lambda c: c.environment("FetchPush-v4").training(gamma=0.9), "-10 to"),
-        (lambda c: c.environment("FetchPush-v4").training(gamma=0.9, alpha=0.0), None),
-    ],
-)
-def test_target_bounds_below_reachable_values_print_a_warning(make: Any, said: str | None) -> None:
-    config = make(TACConfig().training(target_bounds=(-50.0, 0.0)))
-    if said is None:
-        config.validate()
-    else:
-        with pytest.warns(UserWarning, match=rf"target_bounds .* reachable values, {said}"):
-            config.validate()
 
 
 def test_settings_are_validated_once_until_one_of_them_changes() -> None:

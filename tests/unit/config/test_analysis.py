@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 import yaml
 
-from music_rllib.config.analysis import Hypothesis
 from music_rllib.config.load import load_sweep
 from music_rllib.config.problems import ConfigError
+from music_rllib.config.schema import Hypothesis
 
 Document = dict[str, Any]
 Problems = Callable[[str, Document], list[str]]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
-from music_rllib.config.load import load_sweep, warnings_of
+from music_rllib.config.load import load_sweep
 from music_rllib.config.problems import ConfigError
 from music_rllib.config.run_settings import RunSettings, handed_over, variant_music
 from music_rllib.config.schema import SweepConfig
@@ -279,22 +279,6 @@ def test_a_group_of_the_grid_gives_each_q_its_alpha(
     document["analysis"]["hypotheses"] = ["q = 1.5, alpha = 0.2 against q = 1"]
     with pytest.raises(ConfigError, match=r"\(tac.alpha: 0.05, 0.15\), got 0.2"):
         load(document)
-
-
-def test_unnamed_differences_of_a_hypothesis_print_a_warning(
-    load: Callable[..., SweepConfig],
-) -> None:
-    document = asking("stage = finetune, q = 1 better than stage = alone", stage="finetune")
-    tac = {"entropic_index": 1.0, "alpha": 0.7}
-    document["stages"].append({"name": "alone", "variant": "tac", "tac": tac})
-    assert warnings_of(load(document)) == []
-    tac["gamma"] = 0.9
-    document["stages"][-1]["env_steps"] = 9000
-    (remark,) = warnings_of(load(document))
-    assert (
-        "better than stage = alone' compares runs that also differ in env_steps, tac.gamma"
-        in remark
-    )
 
 
 def test_a_storage_can_name_environment_variables(

@@ -18,7 +18,7 @@ from music_rllib.envs.fingerprint import (
     on_another_machine,
 )
 from music_rllib.envs.make import make_env
-from music_rllib.envs.modules import search_in
+from music_rllib.envs.tasks import search_in
 
 FILES = {
     "lab/__init__.py": "",
@@ -54,7 +54,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
-    monkeypatch.setattr("music_rllib.envs.modules._folders", {})
+    monkeypatch.setattr("music_rllib.envs.tasks._folders", {})
     monkeypatch.setattr(sys, "path", [*sys.path])
     search_in(tmp_path)
     yield tmp_path
@@ -152,7 +152,7 @@ def test_a_model_that_a_worker_generated_is_not_a_difference() -> None:
 def test_a_module_that_is_missing_or_hidden_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("music_rllib.envs.modules._folders", {})
+    monkeypatch.setattr("music_rllib.envs.tasks._folders", {})
     monkeypatch.setattr(sys, "path", [*sys.path])
     search_in(tmp_path)
     said = rf"no module 'lab_nowhere'.*{tmp_path}.*run\.yaml of `best`, in the module's folder"

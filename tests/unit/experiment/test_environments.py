@@ -15,13 +15,13 @@ from music_rllib.experiment.environments import (
     accept_environments,
     changed_text,
     found_runs,
-    mixed,
     remove_runs,
     to_retrain,
 )
 from music_rllib.experiment.open_sweep import OpenSweep, open_sweep
 from music_rllib.experiment.plan import Node, continuation_key, make_plan
 from music_rllib.experiment.scheduler import Status
+from music_rllib.results.analysis import mixed
 from music_rllib.store.history import RunResult
 from music_rllib.store.lease import Lease
 

@@ -56,9 +56,9 @@ def test_only_the_warning_about_rllibs_own_environment_is_hidden() -> None:
 
 def test_importing_the_robotics_environments_prints_nothing() -> None:
     code = (
-        "from music_rllib.runtime.quiet import quiet_third_parties\n"
-        "quiet_third_parties()\n"
-        "import gymnasium, gymnasium_robotics\n"
+        "from music_rllib.envs.tasks import register_robotics\n"
+        "register_robotics()\n"
+        "import gymnasium\n"
         "gymnasium.make('FetchPush-v4').close()\n"
     )
     done = subprocess.run(

@@ -10,13 +10,13 @@ import yaml
 
 from music_rllib.config.load import load_sweep
 from music_rllib.config.run_settings import RunSettings
-from music_rllib.experiment.demand import (
+from music_rllib.runtime.ray_cluster import Capacity
+from music_rllib.sweep.preflight import (
     DemandError,
     _network_numbers,
     check_memory,
     long_runs,
 )
-from music_rllib.runtime.ray_cluster import Capacity
 from music_rllib.tac.networks import Critics, Perceptron
 
 GIB = 2**30
@@ -108,7 +108,7 @@ def test_a_cluster_is_only_asked_if_runs_need_much_memory(
     import contextlib
     from types import SimpleNamespace
 
-    from music_rllib.experiment import demand
+    from music_rllib.sweep import preflight
 
     asked: list[Any] = []
     room = Capacity(now=1, memory=4 * GIB)
@@ -119,14 +119,14 @@ def test_a_cluster_is_only_asked_if_runs_need_much_memory(
         yield room
 
     monkeypatch.setattr("music_rllib.runtime.ray_cluster.cluster", cluster)
-    monkeypatch.setattr("music_rllib.runtime.machine.check_reachable", lambda _: None)
+    monkeypatch.setattr("music_rllib.sweep.preflight.check_reachable", lambda _: None)
     monkeypatch.setenv("RAY_ADDRESS", "head:6379")
 
     def check(**defaults: Any) -> list[str]:
         node = SimpleNamespace(stage="a", key="k", run=run(tmp_path, **defaults))
         config = SimpleNamespace(stages=(), resources="those")
         plan = SimpleNamespace(nodes=[node])
-        return demand.check_demand(SimpleNamespace(plan=plan, config=config, finished=set()))  # type: ignore[arg-type]
+        return preflight.check_demand(SimpleNamespace(plan=plan, config=config, finished=set()))  # type: ignore[arg-type]
 
     assert (check(), asked) == ([], [])
     huge = {"tac": {"hidden_sizes": [20_000, 20_000]}}  # 25 GiB
