@@ -26,14 +26,15 @@ from music_rllib.report.figures.choice import (
 )
 from music_rllib.report.figures.draw import files
 from music_rllib.report.figures.plots import METRICS
-from music_rllib.report.page import SweepReport, render
+from music_rllib.report.page import SweepReport, render, runs_table
 from music_rllib.report.two_sweeps import difference_tables
 from music_rllib.report.videos import Videos, make_videos
 from music_rllib.results.analysis import StageAnalysis, analyse, mixed
+from music_rllib.results.answer import claim_rows, mean_rows
 from music_rllib.results.data import ReportError, Sweep
 from music_rllib.results.statistics import Array
 from music_rllib.results.study import study_of
-from music_rllib.results.tables import performance_tables, runs_table, study_files
+from music_rllib.results.tables import performance_tables, to_csv
 
 PAGE = "report.html"
 PICTURE = "overview"
@@ -256,6 +257,10 @@ def _files_of(report: SweepReport) -> Iterator[tuple[str, bytes]]:
         yield f"videos/{video.file}", video.data
     tables = [*performance_tables(report.analyses), runs_table(report.sweep)]
     numbers = [(table.name, table.to_csv()) for table in tables]
-    numbers.append(("curves", curves_csv(report.drawings)))
-    for name, text in (*study_files(report.study), *numbers):
+    numbers += [
+        ("curves", curves_csv(report.drawings)),
+        ("area_under_curve", to_csv(mean_rows(report.study))),
+        ("comparisons", to_csv(claim_rows(report.study))),
+    ]
+    for name, text in numbers:
         yield f"tables/{name}.csv", text.encode()

@@ -14,7 +14,7 @@ from music_rllib.results.analysis import Curve
 from music_rllib.results.conditions import SIDE_BY_SIDE
 from music_rllib.results.data import Sweep
 from music_rllib.results.statistics import SHOW_SEEDS_BELOW, Array
-from music_rllib.results.table import to_csv
+from music_rllib.results.tables import to_csv
 
 EPOCH = 80_000
 """Environment steps of an epoch in the original MUSIC: 16 workers x 2 rollouts x 50 cycles x 50."""

@@ -25,16 +25,14 @@ from music_rllib.results.answer import answer, planned_in_words
 from music_rllib.results.conditions import SIDE_BY_SIDE, StageRuns
 from music_rllib.results.data import Sweep
 from music_rllib.results.study import Study
-from music_rllib.results.table import DASH, Table
 from music_rllib.results.tables import (
-    budget_table,
-    failures_table,
-    origin_table,
+    DASH,
+    Code,
+    Seconds,
+    Table,
     performance_tables,
-    runs_table,
     search_in_words,
     search_tables,
-    state_in_words,
     study_tables,
 )
 
@@ -254,3 +252,107 @@ def _seeds(stage: StageRuns) -> str:
 def _enumerated(words: Sequence[str], last: str = "and") -> str:
     """`a, b and c`."""
     return f" {last} ".join(filter(None, (", ".join(words[:-1]), words[-1])))
+
+
+# Runs -------------------------------------------------------------------------------------------
+
+
+def budget_table(sweep: Sweep, analyses: Sequence[StageAnalysis]) -> Table:
+    """Environment steps and training time of each stage."""
+    rows = []
+    for stage in (analysis.stage for analysis in analyses):
+        seconds = [s for run in stage.runs if (s := sweep.runs[run].seconds) is not None]
+        rows.append(
+            (
+                stage.name,
+                len(stage.runs),
+                sum(sweep.last_step(run) for run in stage.runs),
+                sum(sweep.runs[run].budget or 0 for run in stage.runs) or None,
+                Seconds(sum(seconds)) if seconds else None,
+                Seconds(statistics.median(seconds)) if seconds else None,
+            )
+        )
+    return Table(
+        title="Budget and training time",
+        header=(
+            "Stage",
+            "Runs",
+            "Steps done",
+            "Steps planned",
+            "Training time, all runs",
+            "Median",
+        ),
+        rows=rows,
+        note="Environment steps. Training time (h:min:s) excludes interruptions; running runs are "
+        "not counted.",
+    )
+
+
+def runs_table(sweep: Sweep) -> Table:
+    """Every run of the sweep, with its last evaluation and its entropies."""
+    return Table(
+        name="runs",
+        title=f"All {len(sweep.runs)} runs",
+        folded=True,
+        header=(
+            *("Run", "Stage", "Task", "q", "Seed", "State", "Steps", "Budget", "Training time"),
+            *("Success rate", "Return", "Shannon entropy", "S_q", "Cause of failure", "Key"),
+        ),
+        rows=[
+            (
+                run.name,
+                run.stage,
+                run.task,
+                run.entropic_index,
+                run.seed,
+                state_in_words(run.status),
+                sweep.last_step(position),
+                run.budget,
+                None if run.seconds is None else Seconds(run.seconds),
+                sweep.final(position, names.EVAL_SUCCESS),
+                sweep.final(position, names.EVAL_RETURN),
+                *(sweep.final(position, metric) for metric in names.ENTROPIES),
+                run.failure,
+                Code(run.run_id),
+            )
+            for position, run in enumerate(sweep.runs)
+        ],
+    )
+
+
+def failures_table(sweep: Sweep) -> Table:
+    """The failed and the damaged runs, with the causes."""
+    return Table(
+        title="Failed runs",
+        header=("Run", "Steps", "Cause"),
+        rows=[
+            (run.name, sweep.last_step(position), Code(run.failure or "no cause was recorded"))
+            for position, run in enumerate(sweep.runs)
+            if run.status == "FAILED" or (run.status == "KILLED" and run.failure)
+        ],
+    )
+
+
+def origin_table(sweep: Sweep, command: str) -> Table:
+    """The storage, the code and the versions that the numbers come from."""
+    prefix = names.TAG_VERSION_PREFIX
+    versions = sorted(
+        f"{tag.removeprefix(prefix)} {value}"
+        for tag, value in sweep.tags.items()
+        if tag.startswith(prefix)
+    )
+    return Table(
+        title="Origin",
+        header=("Item", "Value"),
+        rows=[
+            ("Read from", Code(sweep.source)),
+            ("Git commit", Code(sweep.tags.get(names.TAG_GIT_COMMIT, "unknown"))),
+            ("Versions", ", ".join(versions) or "unknown"),
+            ("Command of this report", Code(command)),
+        ],
+    )
+
+
+def state_in_words(status: str) -> str:
+    """A word for the status of a run or a sweep."""
+    return {"KILLED": "stopped", "SCHEDULED": "waiting"}.get(status, status.lower())

@@ -10,7 +10,7 @@ from music_rllib.results import statistics as st
 from music_rllib.results.analysis import FinalScores, StageAnalysis
 from music_rllib.results.archive import merged
 from music_rllib.results.data import RunRecord, Sweep
-from music_rllib.results.table import Table
+from music_rllib.results.tables import Table
 
 MOST_VALUES = 6
 """Largest number of a setting's values that are listed for one sweep."""

@@ -16,7 +16,7 @@ from music_rllib.envs.tasks import Task
 from music_rllib.experiment.plan import Plan, short
 from music_rllib.experiment.scheduler import Status
 from music_rllib.names import ShortLabels
-from music_rllib.results.table import Table as DataTable
+from music_rllib.results.tables import Table as DataTable
 from music_rllib.results.tables import search_in_words, search_tables
 from music_rllib.search.best import best_text
 from music_rllib.store.history import RunResult

@@ -21,10 +21,10 @@ from music_rllib.experiment.record import keep_record
 from music_rllib.experiment.scheduler import Failure
 from music_rllib.program import main
 from music_rllib.report.build import limitations
+from music_rllib.report.page import failures_table
 from music_rllib.results.analysis import analyse
 from music_rllib.results.read import read_sweep
 from music_rllib.results.study import study_of
-from music_rllib.results.tables import failures_table
 from music_rllib.store.history import HISTORY, Report, RunResult, last_values, to_json_lines
 from music_rllib.store.storage import DamagedError
 from music_rllib.sweep.listeners.state_file import StateFile
