@@ -47,7 +47,6 @@ from music_rllib.config.search import (
     Pruning,
     Rung,
     SearchSettings,
-    WarmStart,
 )
 from music_rllib.config.space import Choice, FloatRange, IntRange
 from music_rllib.config.tac_settings import (
@@ -180,7 +179,6 @@ def document() -> str:
                 ("pruning.rungs", "list", "required", docstrings(Pruning)["rungs"]),
                 *rows(Rung, "pruning.rungs[]."),
                 *rows(FinalRanking, "final."),
-                *rows(WarmStart, "warm_start."),
             ]
         ),
         VARIANTS_TEXT,

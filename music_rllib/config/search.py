@@ -123,15 +123,6 @@ class FinalRanking(StrictModel):
         return self.trials + (points if self.baselines else 0)
 
 
-class WarmStart(StrictModel):
-    """An earlier study that the sampler starts with; its trials are not ranked again."""
-
-    study: str
-    """Its name, as `music-rllib status` shows it, or the beginning of its name."""
-    storage: str | None = None
-    """Its Optuna storage: a database URL or a sqlite file; null: this search's storage."""
-
-
 class SearchSettings(StrictModel):
     """How the trials of a stage are proposed and evaluated."""
 
@@ -175,8 +166,6 @@ class SearchSettings(StrictModel):
     storage: str | None = Field(None, min_length=1)
     """Optuna's storage: `postgresql://user@host/database` (the password comes from `PGPASSWORD` or
     a password file), or another SQLAlchemy URL; null: a sqlite file in the sweep's folder."""
-    warm_start: WarmStart | None = None
-    """An earlier study to learn from; null: none."""
 
     @property
     def objectives(self) -> tuple[Objective, ...]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,8 +17,8 @@ from music_rllib.config.schema import Stage
 from music_rllib.config.search import SearchSettings
 from music_rllib.experiment.plan import Plan, short
 from music_rllib.names import in_runs, symbol
-from music_rllib.results import statistics as st
-from music_rllib.results.conditions import AVERAGED, Condition, final_scores, find_stages
+from music_rllib.results.analysis import FinalScores, stage_scopes
+from music_rllib.results.conditions import ALL_TASKS, Condition, find_stages
 from music_rllib.results.data import Sweep
 from music_rllib.results.statistics import Estimate, with_interval
 from music_rllib.search.objective import interval
@@ -48,64 +47,28 @@ def ranking_metric(stage: Stage, sweep: Sweep) -> RankingMetric:
     return RankingMetric(stage.primary_metric)
 
 
-@dataclass(frozen=True, kw_only=True)
-class ScoredCondition:
-    """A condition of a stage with the mean of its scores."""
+def _finals(stage: str, sweep: Sweep, metric: str) -> dict[str, Sequence[FinalScores]]:
+    """Final values of a stage's conditions by scope: all tasks, or each task if scales differ."""
+    found = next((one for one in find_stages(sweep) if one.name == stage), None)
+    scopes = () if found is None else stage_scopes(sweep, found, metric)
+    whole = scopes[:1] if scopes and scopes[0].name == ALL_TASKS else scopes
+    return {scope.name: scope.finals for scope in whole}
 
-    condition: Condition
-    values: Mapping[str, Any]
+
+def _values(condition: Condition, plan: Plan, sweep: Sweep) -> dict[str, Any]:
     """Settings that differ between the stage's conditions, as the plan has them."""
-    estimate: Estimate
-    """Mean over the tasks that have a result, with its 95% interval."""
-    runs: int
-    """Number of its runs that have a score."""
-    complete: bool
-    """Whether every planned run is finished."""
-
-    @property
-    def value(self) -> float:
-        return float(self.estimate.value)
-
-    @property
-    def ends(self) -> list[float]:
-        """The ends of the interval."""
-        return [float(self.estimate.lower), float(self.estimate.upper)]
-
-
-def scored_conditions(
-    stage: str, plan: Plan, sweep: Sweep, metric: str, task: str | None = None
-) -> list[ScoredCondition]:
-    """The conditions of a stage that have a score by a metric, on all tasks or on one."""
-    found = []
-    for condition in (c for one in find_stages(sweep) if one.name == stage for c in one.conditions):
-        if task is not None:
-            own = tuple(run for run in condition.runs if sweep.runs[run].task == task)
-            condition = replace(condition, runs=own)
-        tasks = dict.fromkeys(sweep.runs[run].task for run in condition.runs)
-        scores = final_scores(sweep, condition, dict.fromkeys(tasks, metric))
-        known = scores[:, ~np.isnan(scores).all(axis=0)]
-        if known.size:
-            episodes = sweep.episodes(condition.runs) if metric in names.EVAL_RATES else None
-            found.append(
-                ScoredCondition(
-                    condition=condition,
-                    values=plan.node(sweep.runs[condition.runs[0]].node_key).values,
-                    estimate=st.estimate(known, episodes),
-                    runs=int(np.sum(~np.isnan(known))),
-                    complete=all(sweep.runs[run].is_finished for run in condition.runs),
-                )
-            )
-    return found
+    return dict(plan.node(sweep.runs[condition.runs[0]].node_key).values)
 
 
 def condition_of(
     best: Mapping[str, Any], stage: Stage, plan: Plan, sweep: Sweep, metric: str
-) -> ScoredCondition | None:
-    """The condition that :func:`best_so_far` has described; None if it has no score by a metric."""
-    for scored in scored_conditions(stage.name, plan, sweep, metric, best.get("task")):
-        same_seeds = stage.search is None or scored.condition.is_fresh == best["on_fresh_seeds"]
-        if same_seeds and dict(scored.values) == best["values"]:
-            return scored
+) -> FinalScores | None:
+    """The condition that :func:`best_so_far` has described; None if it has no final value."""
+    finals = _finals(stage.name, sweep, metric)
+    for final in finals.get(best.get("task", next(iter(finals), "")), ()):
+        same_seeds = stage.search is None or final.condition.is_fresh == best["on_fresh_seeds"]
+        if same_seeds and _values(final.condition, plan, sweep) == best["values"]:
+            return final
     return None
 
 
@@ -127,9 +90,9 @@ def best_so_far(
             best = _best_trial(stage, stage.search, by_stage.get(stage.name))
         if best is not None:
             entropies = {
-                metric: {"value": scored.value, "interval": scored.ends}
+                metric: {"value": final.value, "interval": _ends(final.estimate)}
                 for metric in names.ENTROPIES
-                if (scored := condition_of(best, stage, plan, sweep, metric)) is not None
+                if (final := condition_of(best, stage, plan, sweep, metric)) is not None
             }
             return best | {"entropies": entropies}
     return None
@@ -141,39 +104,51 @@ def _best_condition(stage: Stage, plan: Plan, sweep: Sweep) -> dict[str, Any] | 
     In the second case, the row of the first task has the others under `other_tasks`.
     """
     metric = ranking_metric(stage, sweep).metric
-    tasks = list(dict.fromkeys(run.task for run in sweep.runs if run.stage == stage.name))
-    if metric in AVERAGED or len(tasks) < 2:
-        return _best_row(scored_conditions(stage.name, plan, sweep, metric), stage, metric)
-    rows = []
-    for task in tasks:
-        row = _best_row(scored_conditions(stage.name, plan, sweep, metric, task), stage, metric)
-        rows += [] if row is None else [row | {"task": task}]
-    return rows[0] | {"other_tasks": rows[1:]} if rows else None
+    finals = _finals(stage.name, sweep, metric)
+    several = len(finals) > 1
+    rows = [
+        _best_row(task, found, stage, metric, plan, sweep) | ({"task": task} if several else {})
+        for task, found in finals.items()
+        if found
+    ]
+    if not rows:
+        return None
+    return rows[0] | ({"other_tasks": rows[1:]} if several else {})
 
 
 def _best_row(
-    candidates: Sequence[ScoredCondition], stage: Stage, metric: str
-) -> dict[str, Any] | None:
+    task: str,
+    finals: Sequence[FinalScores],
+    stage: Stage,
+    metric: str,
+    plan: Plan,
+    sweep: Sweep,
+) -> dict[str, Any]:
     """The condition with the best mean, among complete ones if there are any."""
-    finite = [scored for scored in candidates if math.isfinite(scored.value)]
-    ranked = [scored for scored in finite if scored.complete] or finite
-    if not ranked:
-        return None
-    best = max(ranked, key=lambda scored: scored.value)
-    planned = len(best.condition.runs)
+
+    def planned(final: FinalScores) -> int:
+        tasks = [sweep.runs[run].task for run in final.condition.runs]
+        return len(tasks) if task == ALL_TASKS else tasks.count(task)
+
+    ranked = [final for final in finals if final.runs == planned(final)] or finals
+    best = max(ranked, key=lambda final: final.value)
     return {
         "stage": stage.name,
-        "values": dict(best.values),
+        "values": _values(best.condition, plan, sweep),
         "by": names.word_of(metric),
         "metric": metric,
         "direction": "maximize",
         "value": best.value,
-        "level": sum(math.isclose(scored.value, best.value) for scored in ranked) - 1,
-        "interval": best.ends,
-        "runs": planned if best.complete else best.runs,
-        "planned": planned,
+        "level": sum(math.isclose(final.value, best.value) for final in ranked) - 1,
+        "interval": _ends(best.estimate),
+        "runs": best.runs,
+        "planned": planned(best),
         "on_fresh_seeds": False,
     }
+
+
+def _ends(estimate: Estimate) -> list[float]:
+    return [float(estimate.lower), float(estimate.upper)]
 
 
 def _best_trial(
@@ -208,7 +183,7 @@ def _best_trial(
         "direction": direction,
         "value": value,
         "level": sum(math.isclose(other, value) for other in values) - 1,
-        "interval": [float(estimate.lower), float(estimate.upper)],
+        "interval": _ends(estimate),
         "runs": scores.size,
         "planned": scores.size,
         "on_fresh_seeds": bool(ranking),

@@ -67,7 +67,6 @@ def _study(search: Search, study: OptunaStudy, thorough: bool) -> dict[str, Any]
     return {
         "values": study.compared,
         "study": study.name,
-        "learnt_from": len(study.warm_start),
         **{state: states.count(state) for state in ("judged", "pruned", "failed", "running")},
         "trials": [_trial(search, study, trial, thorough) for trial in trials],
         "best": best[0].number if best else None,

@@ -48,16 +48,10 @@ optuna.logging.set_verbosity(optuna.logging.WARNING)
 class Proposer:
     """Proposes the points of one study."""
 
-    def __init__(
-        self,
-        settings: SearchSettings,
-        points: Sequence[Mapping[str, Any]] = (),
-        warm_start: Sequence[FrozenTrial] = (),
-    ) -> None:
-        """Propose `points` first; the sampler also uses the complete trials `warm_start`."""
+    def __init__(self, settings: SearchSettings, points: Sequence[Mapping[str, Any]] = ()) -> None:
+        """Propose `points` first."""
         self._settings = settings
         self._points = list(points)
-        self._warm_start = list(warm_start)
 
     def propose(
         self, number: int, ended: Sequence[FrozenTrial], running: Sequence[FrozenTrial]
@@ -79,7 +73,7 @@ class Proposer:
         study = optuna.create_study(
             directions=directions_of(self._settings), sampler=self._sampler(number)
         )
-        study.add_trials([*self._warm_start, *ended])
+        study.add_trials(ended)
         for other in running:
             study.add_trial(
                 create_trial(

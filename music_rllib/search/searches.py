@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,7 @@ from music_rllib.config.search import Rung, SearchSettings
 from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.plan import Run, node_key
 from music_rllib.results.statistics import Array
-from music_rllib.search.new_study import no_study_error
-from music_rllib.search.storage import known_studies, open_studies
+from music_rllib.search.storage import check_database, open_studies
 from music_rllib.search.study import OptunaStudy
 
 STUDY_FILE = "study.db"
@@ -79,32 +78,19 @@ class Search:
 
 
 def check_studies(sweep: OpenSweep) -> None:
-    """Check that the searches' databases and the studies of their warm starts exist.
+    """Check that the searches' databases can be used.
 
     Nothing is created, so that a sweep that is only planned leaves nothing behind.
 
     Raises:
-        StorageError: A database can't be used, or there is no such study.
+        StorageError: A database can't be used.
     """
-    earlier: list[str] = []
-    """Beginnings of the names of earlier stages' studies, which are created before this one's."""
     for stage in sweep.plan.searched:
-        settings = stage.search
-        assert settings is not None
-        base, storage = _base(sweep, stage), _storage(sweep, settings)
+        assert stage.search is not None
+        storage = _storage(sweep, stage.search)
         # The sweep's folder may not exist yet.
-        known = known_studies(storage) if settings.storage or Path(storage).exists() else []
-        exists = any(name.startswith((f"{base} @", f"{base}/")) for name in known)
-        warm = settings.warm_start
-        if warm is not None and not exists:
-            if warm.storage is not None:
-                known = known_studies(warm.storage, warm_start=True)
-            if not (
-                any(name.startswith(warm.study) for name in (*known, *earlier))
-                or any(warm.study.startswith(name) for name in earlier)
-            ):
-                raise no_study_error(warm, known)
-        earlier.append(base)
+        if stage.search.storage or Path(storage).exists():
+            check_database(storage)
 
 
 def open_searches(sweep: OpenSweep) -> list[Search]:
@@ -114,16 +100,6 @@ def open_searches(sweep: OpenSweep) -> list[Search]:
         StorageError: A study's storage can't be used.
     """
     return [_open_search(sweep, stage) for stage in sweep.plan.searched]
-
-
-def warm_starts(searches: Sequence[Search]) -> list[str]:
-    """One line for each study with a warm start, with the studies that its trials come from."""
-    return [
-        f"{search.label(study)}: {study.warm_start_text}"
-        for search in searches
-        for study in search.studies
-        if study.warm_start_text
-    ]
 
 
 def _base(sweep: OpenSweep, stage: Stage) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 
 from optuna.exceptions import StorageInternalError
 from optuna.storages import BaseStorage, RDBStorage, get_storage
-from sqlalchemy import create_engine, inspect, text
+from sqlalchemy import create_engine, inspect
 from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError, IntegrityError, ProgrammingError, SQLAlchemyError
 
@@ -22,23 +22,20 @@ from music_rllib.store.storage import StorageError, database_url, sqlite_url
 
 DATABASE_ERRORS = (StorageInternalError, SQLAlchemyError)
 """Errors of a database that does not answer, or not now."""
-SETTING, WARM_SETTING = "search.storage", "search.warm_start.storage"
+SETTING = "search.storage"
 
 
-def open_studies(url: str, *, warm_start: bool = False) -> BaseStorage:
-    """Open the storage of a search, which is created if it does not exist, or of a warm start.
+def open_studies(url: str) -> BaseStorage:
+    """Open the storage of a search, which is created if it does not exist.
 
     Args:
         url: SQLAlchemy's URL, or the path of an SQLite file. PostgreSQL's password comes from
             `PGPASSWORD` or a password file.
-        warm_start: Whether it is the storage of a warm start, which must have studies.
 
     Raises:
-        StorageError: The database can't be reached, or must have studies and does not.
+        StorageError: The database can't be reached.
     """
-    if warm_start:
-        known_studies(url, warm_start=True)
-    with _checked(url, WARM_SETTING if warm_start else SETTING) as parsed:
+    with _checked(url) as parsed:
         # If two drivers find a new database at the same moment, one fails to create a table that
         # the other is creating, and finds it when it tries again.
         for wait in (0.5, 1.0, 2.0, 4.0):
@@ -48,40 +45,25 @@ def open_studies(url: str, *, warm_start: bool = False) -> BaseStorage:
         return _storage(parsed)
 
 
-def known_studies(url: str, *, warm_start: bool = False) -> list[str]:
-    """Names of the studies in a database, the oldest first; changes nothing there.
-
-    Args:
-        url: As for `open_studies`; the database of a search may be missing.
-        warm_start: Whether it is the storage of a warm start, which must have studies.
+def check_database(url: str) -> None:
+    """Check that a database can be used, or be created; changes nothing there.
 
     Raises:
-        StorageError: It can't be reached, can't be created, or must have studies and does not.
+        StorageError: It can't.
     """
-    setting = WARM_SETTING if warm_start else SETTING
-    with _checked(url, setting) as parsed:
+    with _checked(url) as parsed:
         file = _file_of(parsed)
         if file is not None and not file.is_file():
-            if warm_start:
-                raise StorageError(f"{setting} must be an existing SQLite file, got {redact(url)}")
             if not os.access(file.absolute().parent, os.W_OK | os.X_OK):
                 raise StorageError(
-                    f"{setting} must be in a folder that can be written, got {redact(url)}"
+                    f"{SETTING} must be in a folder that can be written, got {redact(url)}"
                 )
-            return []
+            return
         engine = create_engine(parsed, **_engine_options(parsed))
         try:
-            if inspect(engine).has_table("studies"):
-                with engine.connect() as connection:
-                    found = connection.execute(
-                        text("SELECT study_name FROM studies ORDER BY study_id")
-                    )
-                    return [str(name) for name in found.scalars()]
+            inspect(engine).has_table("studies")
         finally:
             engine.dispose()
-        if warm_start:
-            raise StorageError(f"{setting} must be a database with studies, got {redact(url)}")
-        return []
 
 
 def studies_of(storage: BaseStorage) -> list[Any]:
@@ -90,7 +72,7 @@ def studies_of(storage: BaseStorage) -> list[Any]:
 
 
 @contextlib.contextmanager
-def _checked(url: str, setting: str) -> Iterator[URL]:
+def _checked(url: str) -> Iterator[URL]:
     """The parsed URL; errors of the database become errors that name the setting.
 
     Raises:
@@ -100,7 +82,7 @@ def _checked(url: str, setting: str) -> Iterator[URL]:
         parsed = make_url(database_url(url if "://" in url else sqlite_url(Path(url).expanduser())))
         if parsed.password:
             raise StorageError(
-                f"{setting} must not hold a password, got one in {redact(url)}: put it into the "
+                f"{SETTING} must not hold a password, got one in {redact(url)}: put it into the "
                 "environment as PGPASSWORD, or into ~/.pgpass"
             )
         yield parsed
@@ -109,7 +91,7 @@ def _checked(url: str, setting: str) -> Iterator[URL]:
     except (*DATABASE_ERRORS, ArgumentError, ImportError, RuntimeError) as error:
         cause = first_line(error.__cause__ or error)
         raise StorageError(
-            f"{setting} must be a database that can be used, got {redact(url)}: {redact(cause)}"
+            f"{SETTING} must be a database that can be used, got {redact(url)}: {redact(cause)}"
         ) from error
 
 

@@ -22,13 +22,8 @@ from optuna.storages import BaseStorage
 from optuna.trial import FrozenTrial, TrialState, create_trial
 
 from music_rllib.config.search import SearchSettings
-from music_rllib.search.new_study import (
-    POINTS,
-    WARM_START,
-    WARM_START_TEXT,
-    find_or_create,
-)
-from music_rllib.search.sampler import VALUES, Proposer, directions_of, trial_at
+from music_rllib.search.new_study import POINTS, find_or_create
+from music_rllib.search.sampler import VALUES, Proposer, directions_of
 
 # Attributes of a trial, in addition to its point.
 OWNER, REASON, SCORES = "owner", "reason", "scores"
@@ -73,14 +68,7 @@ class OptunaStudy:
         self._me = f"{socket.gethostname()}:{os.getpid()}:{uuid.uuid4().hex[:8]}"
         self._id, self.name = find_or_create(storage, base, settings, determined_by, compared)
         attributes = storage.get_study_user_attrs(self._id)
-        self.warm_start = [
-            trial_at(settings.space, data["values"], data["judged"])
-            for data in attributes.get(WARM_START, [])
-        ]
-        """Trials of older studies that the sampler uses."""
-        self.warm_start_text = str(attributes.get(WARM_START_TEXT, ""))
-        """The studies of these trials in words; empty without a warm start."""
-        self._proposer = Proposer(settings, attributes[POINTS], self.warm_start)
+        self._proposer = Proposer(settings, attributes[POINTS])
         self._last_heartbeat = 0.0
         self._trials: list[FrozenTrial] | None = None
         self._begun: set[int] = set()

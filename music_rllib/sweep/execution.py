@@ -35,7 +35,7 @@ from music_rllib.experiment.sweep_files import SEARCH
 from music_rllib.redaction import redact
 from music_rllib.search.controller import SearchController
 from music_rllib.search.outcome import outcome
-from music_rllib.search.searches import open_searches, warm_starts
+from music_rllib.search.searches import open_searches
 from music_rllib.store.storage import below, is_remote, sweep_folder
 
 LAST_SECONDS = 20.0
@@ -204,11 +204,8 @@ def begin_searches(
         mlflow_log.finished(node)
         state_file.reused(node)
 
-    searches = open_searches(opened)
-    for line in warm_starts(searches):
-        display.say(line)
     controller = SearchController(
-        opened, searches, reused=reused, pruned=mlflow_log.pruned, say=display.say
+        opened, open_searches(opened), reused=reused, pruned=mlflow_log.pruned, say=display.say
     )
     state_file.searches = lambda: outcome(controller, thorough=False)
     controller.recall()

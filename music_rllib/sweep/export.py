@@ -25,12 +25,7 @@ from music_rllib.results.conditions import Condition
 from music_rllib.results.data import LastValues, RunRecord, Sweep
 from music_rllib.results.read import searches_of
 from music_rllib.results.statistics import with_interval
-from music_rllib.search.best import (
-    ScoredCondition,
-    best_so_far,
-    condition_of,
-    ranking_metric,
-)
+from music_rllib.search.best import best_so_far, condition_of, ranking_metric
 from music_rllib.store.storage import StorageError, is_remote, write_atomically
 
 CHOSEN = "chosen.json"
@@ -122,10 +117,11 @@ def _export_condition(
         "success_rate": None if success is None else float(success.estimate.value),
         "entropies": best.get("entropies", {}),
         "on_fresh_seeds": best["on_fresh_seeds"],
-        "why": _reason(stage, best, scored),
+        "why": _reason(stage, best, scored.condition),
     }
     policies = []
     tasks = list(dict.fromkeys(sweep.runs[run].task for run in scored.condition.runs))
+    tasks = [best["task"]] if "task" in best else tasks
     for task in tasks:
         run = _median_run(sweep, scored.condition, task, metric)
         if run is None:
@@ -143,19 +139,18 @@ def _export_condition(
     return chosen | {"policies": policies}
 
 
-def _reason(stage: Stage, best: Mapping[str, Any], scored: ScoredCondition) -> str:
-    by, condition = best["by"], scored.condition
-    level = best.get("level", 0)
+def _reason(stage: Stage, best: Mapping[str, Any], condition: Condition) -> str:
+    by, level = best["by"], best["level"]
     rank = f"ties for first with {level} more" if level else "is first"
     seeds = "fresh seeds" if best["on_fresh_seeds"] else "the seeds that selected it"
     text = (
         f"{stage.name}: {condition.short_label} {rank} by {by} on {seeds}; {by} "
         f"({'' if stage.search else 'mean, '}95% CI): "
-        f"{with_interval(best['value'], best['interval'])} over {in_runs(scored.runs)}"
+        f"{with_interval(best['value'], best['interval'])} over {in_runs(best['runs'])}"
     )
-    if scored.complete:
+    if best["runs"] == best["planned"]:
         return text
-    return f"{text}, of {len(condition.runs)} planned: no condition has all of its runs"
+    return f"{text}, of {best['planned']} planned: no condition has all of its runs"
 
 
 def _median_run(sweep: Sweep, condition: Condition, task: str, metric: str) -> RunRecord | None:

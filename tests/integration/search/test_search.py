@@ -19,7 +19,6 @@ import requests
 from sqlalchemy import create_engine, inspect, text
 
 from music_rllib import names
-from music_rllib.search.storage import known_studies
 from music_rllib.store.storage import database_url
 from music_rllib.tracking.store import resolve_store
 from tests.faults import comparison
@@ -247,7 +246,6 @@ def test_a_plan_leaves_nothing_in_a_database(
     engine = create_engine(database_url(postgresql))
     assert inspect(engine).get_table_names() == []
     engine.dispose()
-    assert known_studies(postgresql) == []
 
 
 def test_two_drivers_on_postgresql_lose_and_double_no_trial(

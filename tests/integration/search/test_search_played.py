@@ -36,8 +36,6 @@ from music_rllib.results.analysis import stage_scopes
 from music_rllib.results.conditions import find_stages
 from music_rllib.results.read import read_sweep
 from music_rllib.search.outcome import outcome
-from music_rllib.search.searches import warm_starts
-from music_rllib.store.storage import StorageError
 from music_rllib.sweep.listeners.state_file import StateFile
 from tests.played_search import SPACE, Document, Driver, document, points, searched, success
 
@@ -506,94 +504,6 @@ def test_a_choice_that_becomes_a_range_keeps_its_numbers(tmp_path: Path) -> None
     space = {"tac.alpha": {"float": [0.05, 0.5]}}
     after = searched(tmp_path, {"space": space, "trials": 3})
     assert points(after.trials())[:2] == [{"tac.alpha": 0.1}, {"tac.alpha": 0.2}]
-    study = before.outcome()["arms"][0]["study"]
-    warm = {"study": study, "storage": str(tmp_path / "results/s/study.db")}
-    learning = searched(tmp_path, {"space": space, "trials": 1, "warm_start": warm}, name="warm")
-    assert learning.outcome()["arms"][0]["learnt_from"] == 2
-
-
-def test_a_warm_start_learns_from_an_older_study_and_does_not_rank_it(tmp_path: Path) -> None:
-    searched(tmp_path, {"trials": 12})
-    warm = {"study": "s/finetune", "storage": str(tmp_path / "results/s/study.db")}
-    cold = searched(tmp_path, {"trials": 4}, name="cold").trials()
-    driver = searched(tmp_path, {"trials": 4, "warm_start": warm}, name="warm")
-    assert driver.outcome()["arms"][0]["learnt_from"] == 12
-    assert len(driver.trials()) == 4
-    values = [trial["objective"][0] for trial in driver.trials()]
-    assert np.mean(values) > np.mean([trial["objective"][0] for trial in cold])
-
-
-COMPARED: Document = {
-    "mode": "compare",
-    "compare": {"tac.entropic_index": [1.0, 1.5]},
-    "space": {"tac.alpha": SPACE["tac.alpha"]},
-    "trials": 2,
-}
-
-
-def warm_from(folder: Path, study: str) -> Document:
-    return {"study": study, "storage": str(folder / "results/s/study.db")}
-
-
-def test_a_warm_start_learns_from_every_value_of_a_comparison(tmp_path: Path) -> None:
-    searched(tmp_path, COMPARED, seeds=[0])
-    narrow = SPACE | {"tac.entropic_index": {"float": [1.0, 1.25], "step": 0.25}}
-    for space, count in ((SPACE, 4), (narrow, 2)):
-        search = {"trials": 1, "warm_start": warm_from(tmp_path, "s/finetune"), "space": space}
-        driver = searched(tmp_path, search, name=f"warm{count}", seeds=[0])
-        (arm,) = driver.outcome()["arms"]
-        assert arm["learnt_from"] == count
-        (line,) = warm_starts(driver.controller.searches)
-        assert line.startswith(f"finetune: warm start from {count} of 4 trials of s/finetune/tac.")
-
-
-def test_a_comparison_learns_for_each_value_from_trials_with_it(tmp_path: Path) -> None:
-    before = searched(tmp_path, COMPARED, seeds=[0])
-    warm = {"warm_start": warm_from(tmp_path, "s/fine")}
-    driver = searched(tmp_path, COMPARED | warm, name="warm", seeds=[0])
-    theirs = before.outcome()["arms"]
-    for number, arm in enumerate(driver.outcome()["arms"]):
-        prior = driver.controller.searches[0].studies[number].warm_start
-        assert [list(trial.values) for trial in prior] == [
-            trial["objective"] for trial in theirs[number]["trials"]
-        ]
-        assert arm["learnt_from"] == 2
-    (tmp_path / "results/s/study.db").unlink()
-    again = Driver(tmp_path, document(COMPARED | warm, name="warm", seeds=[0]))
-    assert [arm["learnt_from"] for arm in again.outcome()["arms"]] == [2, 2], "as it was made"
-
-
-def test_a_warm_start_without_suitable_trials_is_refused(tmp_path: Path) -> None:
-    searched(tmp_path, {"trials": 2}, seeds=[0])
-    content = document(COMPARED | {"warm_start": warm_from(tmp_path, "s/")}, name="warm", seeds=[0])
-    content["stages"][1]["search"]["compare"] = {"tac.entropic_index": [7.0, 8.0]}
-    message = (
-        r"search.warm_start.study must have complete trials with the objectives of "
-        r"warm/finetune/tac.entropic_index=7 and in its space, got s/finetune @\w+: none of 2"
-    )
-    with pytest.raises(StorageError, match=message):
-        Driver(tmp_path, content)
-
-
-def test_a_warm_start_from_a_missing_study_is_refused(tmp_path: Path) -> None:
-    gone = tmp_path / "results/mistyped/study.db"
-    search = {"warm_start": {"study": "s", "storage": str(gone)}}
-    message = r"search.warm_start.storage must be an existing SQLite file, got .*/study.db"
-    with pytest.raises(StorageError, match=message):
-        Driver(tmp_path, document(search))
-    assert not gone.exists()
-    assert not gone.parent.exists()
-    message = r"search.warm_start.study must be \(the beginning of\) a study's name, got 's': there"
-    with pytest.raises(StorageError, match=f"{message} are no other studies in the search's own"):
-        Driver(tmp_path, document({"warm_start": {"study": "s"}}))
-    searched(tmp_path, {"trials": 1}, seeds=[0])
-    with pytest.raises(StorageError, match=r"must be \(the beginning of\) one of s/finetune @"):
-        Driver(tmp_path, document({"warm_start": warm_from(tmp_path, "x")}, name="warm"))
-    (tmp_path / "other.db").touch()
-    search = {"warm_start": {"study": "s", "storage": str(tmp_path / "other.db")}}
-    with pytest.raises(StorageError, match=r"warm_start.storage must be a database with studies"):
-        Driver(tmp_path, document(search))
-    assert (tmp_path / "other.db").stat().st_size == 0
 
 
 def test_settings_of_the_pretraining_can_be_searched_and_are_shared(tmp_path: Path) -> None:

@@ -181,14 +181,6 @@ REFUSED: list[tuple[Document, str]] = [
         "search.storage must be in a folder that can be written, got sqlite:///nowhere/studies.db",
     ),
     (
-        searched(warm_start={"study": "older/a"}),
-        "search.warm_start.study must be (the beginning of) a study's name, got 'older/a': there",
-    ),
-    (
-        searched(warm_start={"study": "older/a", "storage": "sqlite:///older.db"}),
-        "search.warm_start.storage must be an existing SQLite file, got sqlite:///older.db",
-    ),
-    (
         document(resources={"num_cpus": 1, "memory_per_run": 1e6}),
         "resources.memory_per_run must be <= ",
     ),
@@ -232,13 +224,6 @@ def test_a_refused_configuration_does_not_replace_the_one_that_ran(
     other = document(seeds=[7], mlflow={"tracking_uri": "http://127.0.0.1:9"})
     assert program(other).exit_code == 2
     assert (tmp_path / "results/s/config.json").read_text() == before
-
-
-def test_a_search_may_learn_from_a_stage_above_it(program: Program) -> None:
-    """Its study is made with the sweep's own."""
-    first = searched()["stages"][0]
-    second = searched(warm_start={"study": "s/a"})["stages"][0] | {"name": "b"}
-    assert program(document(stages=[first, second]), command="plan").exit_code == 0
 
 
 def test_files_that_are_none(program: Program, tmp_path: Path) -> None:
