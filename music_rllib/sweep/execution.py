@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import time
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -12,31 +16,22 @@ from music_rllib import names
 from music_rllib.command_line import how_to_continue
 from music_rllib.errors import FAILED
 from music_rllib.experiment.open_sweep import OpenSweep
+from music_rllib.experiment.plan import Node
 from music_rllib.experiment.scheduler import Status
-from music_rllib.experiment.sweep_files import as_json
+from music_rllib.experiment.sweep_files import SEARCH, as_json
+from music_rllib.redaction import redact
 from music_rllib.runtime.machine import cluster_address
 from music_rllib.runtime.process import give_back_freed_memory, try_for
+from music_rllib.search.controller import SearchController
+from music_rllib.search.outcome import outcome
+from music_rllib.search.searches import open_searches
+from music_rllib.store.storage import below, is_remote, sweep_folder
 from music_rllib.sweep.listeners.mlflow_view import VERSIONS, comparison_view
 from music_rllib.sweep.listeners.prometheus import PrometheusListener
 from music_rllib.sweep.listeners.screen import Display
 from music_rllib.sweep.listeners.state_file import StateFile
 from music_rllib.sweep.views.results import results_table, search_views
 from music_rllib.tracking.tracker import MlflowListener, Tracker
-
-if TYPE_CHECKING:
-    from music_rllib.search.controller import SearchController
-import os
-import subprocess
-import sys
-from pathlib import Path
-
-from music_rllib.experiment.plan import Node
-from music_rllib.experiment.sweep_files import SEARCH
-from music_rllib.redaction import redact
-from music_rllib.search.controller import SearchController
-from music_rllib.search.outcome import outcome
-from music_rllib.search.searches import open_searches
-from music_rllib.store.storage import below, is_remote, sweep_folder
 
 LAST_SECONDS = 20.0
 """Time to write the last state and to close MLflow's runs after Ray has died."""
@@ -86,8 +81,6 @@ def compute_and_report(
         _take_over_reused(opened, display, mlflow_log)
         controller = None
         if opened.plan.searched:
-            from music_rllib.sweep.execution import begin_searches, end_searches
-
             controller = begin_searches(opened, display, mlflow_log, state_file)
         tracker.keep_current(node.key for node in opened.plan.nodes)
         stopped_by = _compute(opened, display, mlflow_log, state_file, controller)

@@ -24,7 +24,7 @@ from music_rllib.experiment.plan import Node, Plan, shared_runs, short
 from music_rllib.experiment.record import plan_document
 from music_rllib.names import in_runs
 from music_rllib.redaction import redact
-from music_rllib.schedules import QUANTITIES, Linear, Measured, Piecewise, value_at
+from music_rllib.schedules import Linear, Measured, Piecewise, value_at
 
 if TYPE_CHECKING:
     from music_rllib.sweep.views.budget import SearchBudget
@@ -49,7 +49,7 @@ def plan_view(config: SweepConfig, plan: Plan, finished: Collection[str]) -> Ren
     parts: list[RenderableType] = [table, *map(Text, lines)]
     if rows := alpha_rows(plan):
         parts.append(_alpha_table(rows))
-    return Group(*parts, *(Text(adaptive_text(row)) for row in adaptive_rows(plan)))
+    return Group(*parts)
 
 
 def _budgets(config: SweepConfig) -> dict[str, SearchBudget]:
@@ -187,12 +187,11 @@ def plan_answer(opened: OpenSweep, changes: str) -> dict[str, Any]:
         "searches": searches,
         "remarks": [*warnings_of(config), *shared_runs(plan)],
         "alpha": alpha_rows(plan),
-        "adaptive": adaptive_rows(plan),
         "changes": changes or None,
     }
 
 
-# -- alpha and settings that follow a measurement -------------------------------------------------
+# -- alpha ----------------------------------------------------------------------------------------
 
 
 def alpha_rows(plan: Plan) -> list[dict[str, Any]]:
@@ -208,8 +207,9 @@ def alpha_rows(plan: Plan) -> list[dict[str, Any]]:
     # Only the joint entropy's scale depends on the number of dimensions of an action.
     joint = {n.run.task.name: n.run.task for n in scaled if n.run.tac.entropy_form == "joint"}
     dimensions = {name: _action_dimensions(task) for name, task in joint.items()}
-    rows = _unique(_alpha_row(node, dimensions.get(node.run.task.name, 1)) for node in scaled)
-    return sorted(rows, key=lambda row: (row["stage"], row["alpha"], row["q_at_start"]))
+    rows = (_alpha_row(node, dimensions.get(node.run.task.name, 1)) for node in scaled)
+    unique = {repr(row): row for row in rows}.values()
+    return sorted(unique, key=lambda row: (row["stage"], row["alpha"], row["q_at_start"]))
 
 
 def _alpha_row(node: Node, action_dimensions: int) -> dict[str, Any]:
@@ -247,29 +247,3 @@ def _alpha_table(rows: Iterable[dict[str, Any]]) -> Table:
         numbers = (f"{row['at_start']:.4g}", f"{row['at_end']:.4g}")
         table.add_row(row["stage"], row["alpha"], row["q"], *numbers)
     return table
-
-
-def adaptive_rows(plan: Plan) -> list[dict[str, Any]]:
-    """The settings of each stage that follow a measurement, with their points."""
-    return _unique(
-        {"stage": node.stage, "setting": name} | setting.model_dump(mode="json")
-        for node in plan.nodes
-        for name, setting in (
-            ("tac.entropic_index", node.run.tac.entropic_index),
-            ("music.mi_reward_weight", node.run.music.mi_reward_weight),
-        )
-        if isinstance(setting, Measured)
-    )
-
-
-def _unique(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
-    return list({repr(row): row for row in rows}.values())
-
-
-def adaptive_text(row: dict[str, Any]) -> str:
-    """`her: tac.entropic_index follows the success rate: 2 at 0.2, 1 at 0.9`."""
-    points = ", ".join(f"{value:g} at {measured:g}" for measured, value in row["points"])
-    text = f"{row['stage']}: {row['setting']} follows the {QUANTITIES[row['follows']]}: {points}"
-    if row["smoothing"]:
-        text += f"; averaged over {row['smoothing']:g} env steps"
-    return text + ("; never goes back" if row["monotone"] else "")

@@ -466,6 +466,17 @@ def test_each_mistake_is_reported(
     assert len(lines) == 1, "one mistake, one line"
 
 
+def test_mistakes_in_defaults_are_reported_beside_an_invalid_stage(
+    problems: Callable[[Document], list[str]],
+) -> None:
+    stage = {"name": "train", "variant": "sac"}
+    lines = problems(SOUND | {"defaults": {"tac": {"lr": -1}}, "stages": [stage]})
+    assert [line.partition(": ")[2].partition(" ")[0] for line in lines] == [
+        "defaults.tac.lr",
+        "stages.train.variant",
+    ]
+
+
 def test_all_mistakes_are_reported_at_once_in_the_order_of_the_file(
     problems: Callable[[Document], list[str]],
 ) -> None:
