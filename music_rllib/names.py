@@ -197,6 +197,8 @@ VARIABLE_STORAGE = "MUSIC_RLLIB_STORAGE"
 """Storage for the report at a sweep's end, if it is a bucket."""
 VARIABLE_REPORT = "MUSIC_RLLIB_REPORT"
 """`off`: write no report at a sweep's end."""
+VARIABLE_PROGRESS = "MUSIC_RLLIB_PROGRESS"
+"""`all`: print each evaluation, not only one line in 30 seconds for each run."""
 
 
 SYMBOLS = {"q": "entropic_index", "weight": "mi_reward_weight"}

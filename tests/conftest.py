@@ -18,6 +18,8 @@ os.environ.update(
         "NO_COLOR": "1",
         # Seconds for each sweep; the test of it asks for it.
         "MUSIC_RLLIB_REPORT": "off",
+        # Tests wait for the line of an evaluation.
+        "MUSIC_RLLIB_PROGRESS": "all",
     }
 )
 for _name in ("FORCE_COLOR", "RAY_ADDRESS", "MLFLOW_TRACKING_URI", "MLFLOW_RUN_ID"):

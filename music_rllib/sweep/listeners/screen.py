@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
@@ -20,8 +21,8 @@ from music_rllib.store.history import Report, RunResult, last_values
 from music_rllib.sweep.views.results import evaluation_text, measured
 
 REFRESH_SECONDS = 0.5
-QUIET_SECONDS = 30.0
-"""Without a terminal, a running run prints its progress at least this often."""
+PROGRESS_SECONDS = 30.0
+"""Time between two lines about the progress of a run, where there is no terminal."""
 WIDE = 76
 """Smallest number of columns for the whole live table."""
 
@@ -102,7 +103,8 @@ class Display(Listener):
         """Env steps of runs that were interrupted, stopped early or failed."""
         self._running: dict[str, tuple[Node, Throughput]] = {}
         self._printed: dict[str, float] = {}
-        """Node key to the time of the last line about its progress."""
+        """Node key to the time of its last line."""
+        self._print_all = os.environ.get(names.VARIABLE_PROGRESS) == "all"
         self._refreshed = self._headed = self._began
         self._live = Live(console=console, auto_refresh=False, transient=True)
 
@@ -125,6 +127,7 @@ class Display(Listener):
     def started(self, node: Node) -> None:
         self._spent.pop(node.key, None)
         self._running[node.key] = (node, self._new_throughput(node))
+        self._printed[node.key] = self._now()
         self._say_of(node, "started")
 
     def _new_throughput(self, node: Node) -> Throughput:
@@ -135,9 +138,9 @@ class Display(Listener):
         throughput.add(reports, self._now())
         if self._console.is_terminal or throughput.env_steps >= node.run.env_steps:
             return  # the table shows it, or the line of `finished` will
-        evaluated = any(names.EVAL_EPISODES in report.metrics for report in reports)
-        last = self._printed.get(node.key, self._began)
-        if evaluated or self._now() - last >= QUIET_SECONDS:
+        wanted = self._print_all and any(names.EVAL_EPISODES in one.metrics for one in reports)
+        last = self._printed.setdefault(node.key, self._began)
+        if wanted or self._now() - last >= PROGRESS_SECONDS:
             self._printed[node.key] = self._now()
             self._say_of(node, self._progress_text(node, throughput))
 
@@ -180,7 +183,7 @@ class Display(Listener):
             if now - self._refreshed >= REFRESH_SECONDS:
                 self._refreshed = now
                 self._live.update(self._view(), refresh=True)
-        elif now - self._headed >= QUIET_SECONDS:
+        elif now - self._headed >= PROGRESS_SECONDS:
             self._headed = now
             _, best = self.headline()
             if best is not None and best != self._best:

@@ -215,17 +215,25 @@ def test_without_a_terminal_there_are_plain_lines(plan: Plan) -> None:
     ]
 
 
-def test_a_run_without_evaluations_is_heard_of_now_and_then(plan: Plan) -> None:
+def test_a_run_prints_its_progress_every_30_seconds(
+    plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv(names.VARIABLE_PROGRESS)
     console, text = screen()
     scheduler, time = Scheduler(plan, finished=()), Clock()
     with Display(console, plan, scheduler, time) as display:
+        time.now += 20  # the run waits
         scheduler.start(plan.nodes[0].key)
         display.started(plan.nodes[0])
         for second in range(1, 100):
             time.now += 1
-            display.reported(plan.nodes[0], [report(10 * second, second)])
+            metrics = {names.EVAL_EPISODES: 5, names.EVAL_SUCCESS: 0.2} if second < 20 else {}
+            display.reported(plan.nodes[0], [report(10 * second, second, **metrics)])
     _, first, *more = text.getvalue().splitlines()
-    assert first == ("[  0:30] pretrain/seed0: 300 of 2,000 env steps, 10 steps/s, 2:50 left")
+    assert first == (
+        "[  0:50] pretrain/seed0: 300 of 2,000 env steps, 10 steps/s, 2:50 left, "
+        "success 20 % (any step -)"
+    )
     assert len(more) == 2
 
 
