@@ -28,6 +28,7 @@ GROUPS = {
     "checkpoint": "checkpoint",
     "memory": "memory",
     "sweep": "sweep",
+    "warm": "warm_workers",
     "search": "search",
     "report": "report",
 }
@@ -36,6 +37,7 @@ examples:
   python -m benchmarks                       the whole table, more than an hour
   python -m benchmarks step environment      two groups of it
   python -m benchmarks --repeats 9 step      more turns
+  BENCH_RUNS=12 python -m benchmarks warm    12 runs, not 60, in warm and in new processes
 
 Stable-Baselines3, SBX and a JAX jit are compared with where they are installed:
 pip install -e '.[bench]'. Targets count by wall and by CPU time; the latter is of all threads.

@@ -41,8 +41,11 @@ class Scheduler:
         """All nodes of `plan`; nodes with a key in `finished` are done, the others wait."""
         self._nodes = {node.key: node for node in plan.nodes}
         seeds = list(dict.fromkeys(node.run.seed for node in plan.nodes))
-        by_seed = sorted(self._nodes.values(), key=lambda node: seeds.index(node.run.seed))
-        self._turns = {node.key: turn for turn, node in enumerate(by_seed)}
+        inputs = {node.input.key for node in plan.nodes if node.input is not None}
+        in_order = sorted(
+            plan.nodes, key=lambda node: (seeds.index(node.run.seed), node.key not in inputs)
+        )
+        self._turns = {node.key: turn for turn, node in enumerate(in_order)}
         self._until: dict[str, int] = {}
         self._status = {
             key: Status.REUSED if key in finished else Status.WAITING for key in self._nodes
@@ -81,8 +84,9 @@ class Scheduler:
         """The next waiting node whose input is done; None if there is none.
 
         All nodes of a seed come before those of the next seed, so that an interrupted sweep can
-        compare its settings; within a seed they come in the order of the plan. Nodes that a search
-        has added come last, in the order of their addition.
+        compare its settings. Within a seed, nodes from which others start come first, so that the
+        last runs of a sweep do not wait for each other; then in the order of the plan. Nodes that
+        a search has added come last, in the order of their addition.
         """
         ready = (node for node in self.having(Status.WAITING) if self._input_is_there(node))
         return min(

@@ -14,27 +14,29 @@ from music_rllib.experiment.scheduler import Scheduler, Status
 from music_rllib.tune.runner import DagSearcher
 
 
+STAGES: list[dict[str, Any]] = [
+    {"name": "a", "variant": "music-u"},
+    {
+        "name": "b",
+        "variant": "music-r",
+        "init_from": "a",
+        "grid": {"tac.entropic_index": [1.0, 1.5, 2.0]},
+    },
+    {"name": "c", "variant": "music-r", "init_from": "b", "tac": {"gamma": 0.9}},
+]
+
+
+def plan_of(folder: Path, stages: list[dict[str, Any]]) -> Plan:
+    path = folder / "s.yaml"
+    document = {"name": "s", "tasks": ["FetchPush"], "seeds": [0, 1], "stages": stages}
+    path.write_text(yaml.safe_dump(document))
+    return make_plan(load_sweep(path))
+
+
 @pytest.fixture
 def plan(tmp_path: Path) -> Plan:
     """Two pretrained nodes, three finetuned nodes from each, and one more from each of those."""
-    document: dict[str, Any] = {
-        "name": "s",
-        "tasks": ["FetchPush"],
-        "seeds": [0, 1],
-        "stages": [
-            {"name": "a", "variant": "music-u"},
-            {
-                "name": "b",
-                "variant": "music-r",
-                "init_from": "a",
-                "grid": {"tac.entropic_index": [1.0, 1.5, 2.0]},
-            },
-            {"name": "c", "variant": "music-r", "init_from": "b", "tac": {"gamma": 0.9}},
-        ],
-    }
-    path = tmp_path / "s.yaml"
-    path.write_text(yaml.safe_dump(document))
-    return make_plan(load_sweep(path))
+    return plan_of(tmp_path, STAGES)
 
 
 def test_nodes_wait_for_their_inputs(plan: Plan) -> None:
@@ -55,13 +57,23 @@ def test_nodes_wait_for_their_inputs(plan: Plan) -> None:
 
 
 def test_all_runs_of_a_seed_precede_the_next_seed(plan: Plan) -> None:
+    assert order_of(plan) == [(seed, stage) for seed in (0, 1) for stage in "abbbccc"]
+
+
+def test_runs_that_others_start_from_come_first_within_a_seed(tmp_path: Path) -> None:
+    plan = plan_of(tmp_path, [{"name": "x", "variant": "tac"}, *STAGES])
+    assert order_of(plan) == [(seed, stage) for seed in (0, 1) for stage in "abbbxccc"]
+
+
+def order_of(plan: Plan) -> list[tuple[int, str]]:
+    """Seeds and stages of all nodes, if one is computed at a time."""
     scheduler = Scheduler(plan, finished=())
     order = []
     while (ready := scheduler.next_ready()) is not None:
         scheduler.start(ready.key)
         scheduler.finish(ready.key)
         order.append((ready.run.seed, ready.stage))
-    assert order == [(seed, stage) for seed in (0, 1) for stage in "abbbccc"]
+    return order
 
 
 def test_finished_nodes_are_reused(plan: Plan) -> None:
