@@ -13,7 +13,6 @@ from music_rllib.experiment.plan import Plan, make_plan
 from music_rllib.experiment.scheduler import Scheduler, Status
 from music_rllib.tune.runner import DagSearcher
 
-
 STAGES: list[dict[str, Any]] = [
     {"name": "a", "variant": "music-u"},
     {
