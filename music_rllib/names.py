@@ -44,7 +44,8 @@ def primary_metric(success_key: str | None) -> str:
 
 def word_of(metric: str) -> str:
     """The word for an evaluation metric in a line of text; the name of any other metric."""
-    return {EVAL_SUCCESS: "success", EVAL_RETURN: "return"}.get(metric, metric)
+    words = {EVAL_SUCCESS: "success", EVAL_RETURN: "return", EVAL_DISPLACEMENT: "moved"}
+    return words.get(metric, metric)
 
 
 # Training episodes (exploring policy) ---------------------------------------------------------

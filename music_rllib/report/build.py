@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 import re
+import threading
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from itertools import chain
+from multiprocessing import get_context
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,12 +31,13 @@ from music_rllib.report.figures.choice import (
     study_drawings,
 )
 from music_rllib.report.figures.draw import files
-from music_rllib.report.figures.plots import METRICS
+from music_rllib.report.figures.plots import METRICS, Legend, Subplot
 from music_rllib.report.page import SweepReport, render, runs_table
 from music_rllib.report.two_sweeps import difference_tables
 from music_rllib.report.videos import Videos, make_videos
 from music_rllib.results.analysis import StageAnalysis, analyse, mixed
 from music_rllib.results.answer import claim_rows, mean_rows
+from music_rllib.results.conditions import StageRuns
 from music_rllib.results.data import ReportError, Sweep
 from music_rllib.results.statistics import Array
 from music_rllib.results.study import study_of
@@ -96,12 +103,25 @@ def build_report(
         sweep=sweep,
         analyses=analyses,
         study=study,
-        drawings=list(_with_own_names(drawings)),
+        drawings=list(_with_own_names(_without_chance(drawings, stages))),
         differences=() if both is None else difference_tables(*both, analyses),
         limitations=[*sentences, *filter(None, [damaged])],
         command=command,
         videos=make_videos(sweep, analyses, storage, environments) if videos else Videos(),
     )
+
+
+def _without_chance(drawings: Iterator[Drawing], stages: Sequence[StageRuns]) -> Iterator[Drawing]:
+    """The drawings, without the success of stages whose success is chance, if others train for it.
+
+    Such curves look like failure.
+    """
+    rewarded = [stage.name for stage in stages if stage.has_task_reward]
+    unrewarded = {stage.name for stage in stages if rewarded and stage.name not in rewarded}
+    for drawing in drawings:
+        is_rate = drawing.metric is not None and drawing.metric.name in names.EVAL_RATES
+        if not (is_rate and drawing.stage in unrewarded):
+            yield drawing
 
 
 def _with_own_names(drawings: Iterator[Drawing]) -> Iterator[Drawing]:
@@ -202,6 +222,39 @@ def _listed(labels: Sequence[str]) -> str:
 # Files ------------------------------------------------------------------------------------------
 
 
+class Figure(NamedTuple):
+    """A figure in files of its own."""
+
+    name: str
+    subplots: Sequence[Subplot]
+    legend: Legend
+
+
+@contextlib.contextmanager
+def _drawn(figures: Sequence[Figure]) -> Iterator[Iterator[Mapping[str, bytes]]]:
+    """The files of each figure, drawn by a process for each core if it is safe to fork."""
+    cores = len(os.sched_getaffinity(0))
+    if cores == 1 or len(figures) < 2 or threading.active_count() > 1:
+        yield map(_draw, figures)
+        return
+    # Functions that draw cannot be pickled, so the processes inherit the figures.
+    with ProcessPoolExecutor(
+        min(cores, len(figures)), get_context("fork"), _INHERITED.extend, (figures,)
+    ) as pool:
+        yield pool.map(_draw_inherited, range(len(figures)))
+
+
+_INHERITED: list[Figure] = []
+
+
+def _draw_inherited(number: int) -> Mapping[str, bytes]:
+    return _draw(_INHERITED[number])
+
+
+def _draw(figure: Figure) -> Mapping[str, bytes]:
+    return files(figure.subplots, figure.legend)
+
+
 def write_report(report: SweepReport, folder: Path) -> Path:
     """Write the page, `figures/*` (PNG, SVG), `videos/*` and `tables/*.csv` into `folder`.
 
@@ -246,13 +299,14 @@ def made_files(folder: Path) -> list[str]:
 
 def _files_of(report: SweepReport) -> Iterator[tuple[str, bytes]]:
     """Paths, below the report's folder, and contents of its files."""
-    yield PAGE, render(report).encode()
     shown = overview(report.sweep, [analysis.stage for analysis in report.analyses])
-    pictures = [(PICTURE, files(shown, []))] if shown else []
-    drawn = ((drawing.name, files(drawing.subplots, drawing.legend)) for drawing in report.drawings)
-    for name, contents in chain(pictures, drawn):
-        for suffix, content in contents.items():
-            yield f"figures/{name}{suffix}", content
+    figures = [Figure(PICTURE, shown, [])] if shown else []
+    figures += [Figure(one.name, one.subplots, one.legend) for one in report.drawings]
+    with _drawn(figures) as contents:
+        yield PAGE, render(report).encode()  # while other processes draw
+        for figure, content in zip(figures, contents, strict=True):
+            for suffix, data in content.items():
+                yield f"figures/{figure.name}{suffix}", data
     for video in report.videos.videos:
         yield f"videos/{video.file}", video.data
     tables = [*performance_tables(report.analyses), runs_table(report.sweep)]

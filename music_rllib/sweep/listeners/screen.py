@@ -18,7 +18,7 @@ from music_rllib.experiment.plan import Node, Plan
 from music_rllib.experiment.scheduler import Failure, Listener, Scheduler, Status
 from music_rllib.names import ShortLabels
 from music_rllib.store.history import Report, RunResult, last_values
-from music_rllib.sweep.views.results import evaluation_text, measured
+from music_rllib.sweep.views.results import evaluation_text
 
 REFRESH_SECONDS = 0.5
 PROGRESS_SECONDS = 30.0
@@ -152,7 +152,7 @@ class Display(Listener):
 
     def finished(self, node: Node, result: RunResult) -> None:
         self._running.pop(node.key, None)
-        evaluated = evaluation_text(node.run.task, result.metrics)
+        evaluated = evaluation_text(node.run, result.metrics, any_step=True)
         cost = f"{result.env_steps:,} env steps in {clock(result.seconds)}"
         self._say_of(node, f"finished, {evaluated}, {cost}", "green")
 
@@ -195,17 +195,17 @@ class Display(Listener):
         heads = ("running", "env steps", *["steps/s"] * wide, "left", "evaluated")
         table = new_table("", heads, left=["running"])
         for node, throughput in self._running.values():
-            rate, metric = throughput.steps_per_second, node.run.task.primary_metric
+            rate, found = throughput.steps_per_second, throughput.metrics
+            value = evaluation_text(node.run, found, any_step=False)
             done = f"{throughput.env_steps:,} / {throughput.budget:,}"
             if not wide:
                 done = percent(throughput.env_steps / throughput.budget)
-            value = measured(metric, throughput.metrics.get(metric))
             table.add_row(
                 self.short(node.label),
                 done if throughput.env_steps else "preparing",
                 *["-" if rate is None else f"{rate:.0f}"] * wide,
                 clock(throughput.seconds_left(self._now())),
-                "-" if value == "-" else f"{names.word_of(metric)} {value}",
+                value if names.EVAL_EPISODES in found else "-",
             )
         lines, best = self.headline()
         texts = [Text(line, style="dim") for line in [*lines, self._summary()]]
@@ -244,6 +244,6 @@ class Display(Listener):
         rate, left = throughput.steps_per_second, throughput.seconds_left(self._now())
         if rate is not None:
             parts += [f"{rate:.0f} steps/s", f"{clock(left)} left"]
-        if node.run.task.primary_metric in throughput.metrics:
-            parts.append(evaluation_text(node.run.task, throughput.metrics))
+        if names.EVAL_EPISODES in throughput.metrics:
+            parts.append(evaluation_text(node.run, throughput.metrics, any_step=True))
         return ", ".join(parts)

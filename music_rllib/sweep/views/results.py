@@ -12,7 +12,7 @@ from rich.text import Text
 
 from music_rllib import names
 from music_rllib.command_line import clock, new_table, percent
-from music_rllib.envs.tasks import Task
+from music_rllib.config.run_settings import RunSettings
 from music_rllib.experiment.plan import Plan, short
 from music_rllib.experiment.scheduler import Status
 from music_rllib.names import ShortLabels
@@ -37,6 +37,13 @@ def results_table(
         results: Node key to the result, or to the progress of an unfinished run.
     """
     metrics = _metric_columns({node.run.task.primary_metric for node in plan.nodes})
+    moving = {
+        node.key
+        for node in plan.nodes
+        if node.key in results and _moves_objects(node.run, results[node.key].metrics)
+    }
+    if moving:
+        metrics |= {names.EVAL_DISPLACEMENT: "object\nmoved"}
     if any(names.SHANNON_ENTROPY in result.metrics for result in results.values()):
         metrics |= {names.SHANNON_ENTROPY: "entropy,\nnats"}
     heads = ("run", *metrics.values(), "env steps", "time", "state")
@@ -48,8 +55,9 @@ def results_table(
         result, state = results.get(run.key), status(run.key)
         cells = ["-"] * (len(metrics) + 2)
         if result is not None:
-            numbers = (measured(metric, result.metrics.get(metric)) for metric in metrics)
-            cells = [*numbers, f"{result.env_steps:,}", clock(result.seconds)]
+            hidden = names.EVAL_RATES if run.key in moving else ()
+            shown = (result.metrics.get(m) if m not in hidden else None for m in metrics)
+            cells = [*map(measured, metrics, shown), f"{result.env_steps:,}", clock(result.seconds)]
         name = _STATES.get(state, str(state))
         table.add_row(label(run.label), *cells, name, style=_STYLES.get(state))
     return table
@@ -86,17 +94,25 @@ def console_table(table: DataTable) -> Table:
 
 
 def measured(metric: str, value: float | None) -> str:
-    """`35 %` for a rate, `-5.2` for another metric, or `-` for None."""
-    return percent(value) if value is None or metric in names.EVAL_RATES else f"{value:.4g}"
+    """`35 %` for a rate, `0.12 m` for a displacement, `-5.2` for a return, `-` for None."""
+    if value is None or metric in names.EVAL_RATES:
+        return percent(value)
+    return f"{value:.2f} m" if metric == names.EVAL_DISPLACEMENT else f"{value:.4g}"
 
 
-def evaluation_text(task: Task, metrics: Mapping[str, float]) -> str:
-    """A run's last evaluation by its task's primary metric: `success 35 % (any step 40 %)`."""
-    metric = task.primary_metric
+def evaluation_text(run: RunSettings, metrics: Mapping[str, float], *, any_step: bool) -> str:
+    """A run's last evaluation: `success 35 % (any step 40 %)`, `return -5.2` or `moved 0.12 m`."""
+    moves = _moves_objects(run, metrics)
+    metric = names.EVAL_DISPLACEMENT if moves else run.task.primary_metric
     text = f"{names.word_of(metric)} {measured(metric, metrics.get(metric))}"
-    if metric != names.EVAL_SUCCESS:
+    if metric != names.EVAL_SUCCESS or not any_step:
         return text
     return f"{text} (any step {percent(metrics.get(names.EVAL_SUCCESS_ANY))})"
+
+
+def _moves_objects(run: RunSettings, metrics: Mapping[str, float]) -> bool:
+    """Whether a run is shown by how far it moves objects: without a reward, success is chance."""
+    return not run.music.task_reward and names.EVAL_DISPLACEMENT in metrics
 
 
 _STATUSES = (

@@ -155,6 +155,12 @@ def test_results_have_a_row_per_run_whatever_became_of_it(plan: Plan) -> None:
         "failed", "reused", "skipped", "interrupted", "skipped", "started",
     ]  # fmt: skip
     assert rows[4][0] == "finetune/q=1.5,alpha=0.1/seed0"
+    result.metrics[names.EVAL_DISPLACEMENT] = 0.123
+    table = results_table(plan, scheduler.__getitem__, {plan.nodes[1].key: result})
+    rows = [line.split() for line in shown(table).splitlines()[3:]]
+    assert rows[1] == [
+        "pretrain/seed1", "-", "-", "0.12", "m", "0.29", "2,000", "2:05", "reused",
+    ], "without the task's reward, success is chance"  # fmt: skip
 
 
 class Clock:
