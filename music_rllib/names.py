@@ -108,6 +108,8 @@ LEARNER_GROUPS = ("bounds/", "critics/", "entropy/", "loss/", "mutual_informatio
 # Measured in the worker, logged with the other metrics ------------------------------------------
 SYSTEM_CPU = "system/cpu_utilization_percentage"
 SYSTEM_MEMORY = "system/process_memory_megabytes"
+SYSTEM_SECONDS = "system/training_seconds"
+"""Training time so far, without pauses. Frames and exports have it, MLflow does not."""
 
 # Settings of a run as metrics: MLflow compares params as text, so that `q > 1` needs a metric ---
 SETTING_ENTROPIC_INDEX = "setting/entropic_index"

@@ -51,6 +51,7 @@ WANTED = (
     names.EVAL_EPISODES,
     names.ENV_STEPS,
     names.GRAD_UPDATES,
+    names.SYSTEM_SECONDS,
     names.Q_MEAN,
     names.ALPHA,
     names.MI_REWARD_WEIGHT,

@@ -4,7 +4,7 @@
 const X_AXES = {
   steps: "environment steps",
   updates: "gradient updates",
-  seconds: "wall time",
+  seconds: "training time",
   epochs: "epochs of 80,000 steps",
 };
 const choice = { stageName: null, stage: 0, metric: "", x: "steps", smooth: 1, conditions: new Set(), subplots: new Set() };
@@ -48,7 +48,7 @@ function chosen(stage, metric, subplot) {
       seeds: curve.seeds.map(keep),
     };
   }).filter((curve) => curve.x.length);
-  return { curves, xLabel: choice.x === "seconds" ? `wall time (${word})` : X_AXES[choice.x] };
+  return { curves, xLabel: choice.x === "seconds" ? `training time (${word})` : X_AXES[choice.x] };
 }
 
 const metricOf = (name) => data.metrics.find((metric) => metric.name === name);

@@ -58,8 +58,8 @@ _METHOD = (
     "comparisons if there is no plan.",
     "Probability of improvement and performance profiles: Agarwal et al. 2021, Deep Reinforcement "
     "Learning at the Edge of the Statistical Precipice (arXiv:2108.13264).",
-    "The x axes gradient updates and wall time are means over the runs of a curve. Wall time is "
-    "measured from the start of a run and includes interruptions.",
+    "The x axes gradient updates and training time are means over the runs of a curve. Training "
+    "time has no pauses; exports of earlier versions have only the time since a run's start.",
 )
 
 

@@ -209,8 +209,13 @@ class Sweep:
         return steps[is_finite].astype(float), values[is_finite]
 
     def seconds_at(self, run: int) -> tuple[Array, Array]:
-        """Steps of a run's evaluations, and seconds since its start, with pauses."""
-        record = self.runs[run]
+        """Steps of a run's reports, and its training time until these steps in seconds.
+
+        Old exports have no training time, only the time since the start with all pauses.
+        """
+        record, (steps, seconds) = self.runs[run], self.finite(run, names.SYSTEM_SECONDS)
+        if len(steps):
+            return steps, seconds
         if record.started is None:
             return np.empty(0), np.empty(0)
         column = self.column(run, self.primary_metric(record.task))

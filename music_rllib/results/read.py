@@ -208,7 +208,9 @@ def _run(lines: bytes, node: Node, metrics: Collection[str] | None) -> _Run:
         reports = from_json(b"[%s]" % b",".join(lines.splitlines()))
         steps = [report["env_steps"] for report in reports]
         times = [report["timestamp_ms"] for report in reports]
-        measured = [report["metrics"] for report in reports]
+        measured = [
+            {**report["metrics"], names.SYSTEM_SECONDS: report["seconds"]} for report in reports
+        ]
         began = round(times[0] - 1000 * reports[0]["seconds"]) if reports else 0
         settings = run_info(node).settings if reports else {}
         names_of_all = {name for values in measured for name in values} | settings.keys()

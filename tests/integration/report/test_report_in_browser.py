@@ -148,7 +148,7 @@ def test_selections_change_the_curves(open_page: Callable[[], Page], page: Path)
             assert 0 < await tab.evaluate(CURVES) < whole
             for axis, words in (
                 ("updates", "gradient updates"),
-                ("seconds", "wall time (min)"),
+                ("seconds", "training time (min)"),
                 ("epochs", "epochs of 80,000 steps"),
             ):
                 await tab.evaluate(CHOOSE % ["against", axis])

@@ -299,6 +299,8 @@ def test_a_run_is_read_with_its_reports_and_code_versions(tmp_path: Path) -> Non
     run = sweep.runs[0]
     assert run.started == 1_700_000_000_000, "when it began, not when it first reported"
     assert run.seconds == pytest.approx(20.0), "without the pause"
+    at, seconds = sweep.seconds_at(0)
+    assert dict(zip(at, seconds, strict=True)) == {500: 5, 1000: 10, 1500: 15, 2000: 20}
     assert sweep.column(0, names.EVAL_SUCCESS).time.tolist() == [
         report.timestamp_ms for report in reports(1.0, 0, 2000)
     ]
