@@ -17,7 +17,7 @@ import psutil
 
 from benchmarks.measure import Row, Taken, middle, taken_by
 from music_rllib import names
-from music_rllib.config.load import load_sweep
+from music_rllib.config.load import load_config
 from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment.open_sweep import open_sweep
 from music_rllib.experiment.plan import make_plan
@@ -97,7 +97,7 @@ def config(storage: Path) -> SweepConfig:
     """500 runs: 25 conditions on 20 seeds."""
     file = storage / "large.yaml"
     file.write_text(CONFIG.format(seeds=", ".join(map(str, range(20)))))
-    return load_sweep(file)
+    return load_config(file)
 
 
 def make_sweep(storage: Path) -> Path:

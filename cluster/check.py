@@ -413,11 +413,11 @@ def _unknown(given: Any, known: Any, place: str = "") -> Problems:
 
 def check_sweep(_: dict[str, Any], path: Path) -> Problems:
     """As `music-rllib run` does."""
-    from music_rllib.config.load import load_sweep
+    from music_rllib.config.load import load_config
     from music_rllib.config.problems import ConfigError
 
     try:
-        load_sweep(path)
+        load_config(path)
     except ConfigError as error:
         yield from str(error).splitlines()
 

@@ -28,7 +28,6 @@ from music_rllib.config.run_settings import (
     LAYER_KEYS,
     VARIANTS,
     Evaluation,
-    MusicSettings,
     ReplaySettings,
     RunSettings,
 )
@@ -58,6 +57,7 @@ from music_rllib.config.tac_settings import (
     TACSettings,
 )
 from music_rllib.envs.tasks import BUILT_IN_TASKS, Task
+from music_rllib.intrinsic.settings import MusicSettings
 from music_rllib.schedules import Linear, Measured, Piecewise
 
 TARGET = Path(__file__).with_name("configuration.md")

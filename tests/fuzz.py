@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from music_rllib.config.load import load_sweep
+from music_rllib.config.load import load_config
 from music_rllib.config.problems import ConfigError
 from music_rllib.envs.make import is_gymnasium_id
 from music_rllib.experiment.plan import make_plan
@@ -319,7 +319,7 @@ def sweep_file(rng: random.Random, sound: Path, folder: Path) -> Callable[[], ob
     file = folder / "sweep.yaml"
     shutil.copy(sound / "sweep.yaml", file)
     change_file(rng, file)
-    return lambda: make_plan(load_sweep(file))
+    return lambda: make_plan(load_config(file))
 
 
 def state(rng: random.Random, sound: Path, folder: Path) -> Callable[[], object]:

@@ -164,7 +164,7 @@ JOURNEYS = {
         title="From a YAML file to a training step",
         steps=(
             "`music_rllib.sweep.driver:load` reads, checks and resolves the file with "
-            "`music_rllib.config.load:load_sweep`",
+            "`music_rllib.config.load:load_config`",
             "`music_rllib.experiment.plan:make_plan` makes a graph of runs, each with its key: "
             "`music_rllib.experiment.plan:node_key`",
             "`music_rllib.sweep.preflight:check_environments` plays declared environments in a "
@@ -193,8 +193,8 @@ JOURNEYS = {
             "`music_rllib.config.tac_settings:TACSettings` validates it",
             "`music_rllib.training.run:algorithm_config` passes it to "
             "`music_rllib.tac.algorithm:TACConfig`",
-            "`music_rllib.tac.objective:ScheduledSettings` has its current value",
-            "`music_rllib.tac.objective:Objective` uses it: `Objective.losses`, `Objective.ln_q`",
+            "`music_rllib.tac.losses:ScheduledSettings` has its current value",
+            "`music_rllib.tac.losses:TACLoss` uses it: `TACLoss.losses`, `TACLoss.ln_q`",
             "`music_rllib.functional.actor_critic:policy_loss` is the formula",
             "`music_rllib.tac.compiled_update:CompiledUpdate` calls the compiled form in "
             "`kernels/update.py`, with the same formulas and their derivatives",

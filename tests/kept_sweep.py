@@ -7,7 +7,7 @@ from pathlib import Path
 
 import yaml
 
-from music_rllib.config.load import load_sweep
+from music_rllib.config.load import load_config
 from music_rllib.experiment.open_sweep import open_sweep
 from music_rllib.experiment.plan import make_plan
 from music_rllib.experiment.record import keep_record
@@ -27,7 +27,7 @@ def kept_sweep(storage: Path, tracking_uri: str | None = None) -> Path:
         "storage": "elsewhere",
     }
     file.write_text(yaml.safe_dump(document))
-    config = load_sweep(file)
+    config = load_config(file)
     folder = storage / "s"
     keep_record(open_sweep(config, make_plan(config), str(storage)))
     record = {"sweep_name": "s", "sweep_id": "0", "tracking_uri": tracking_uri, "run_id": "1"}

@@ -13,7 +13,7 @@ import yaml
 from ray.tune.search import Searcher
 
 from music_rllib import names
-from music_rllib.config.load import load_sweep
+from music_rllib.config.load import load_config
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.experiment.open_sweep import OpenSweep, open_sweep
 from music_rllib.experiment.plan import Node, make_plan
@@ -69,7 +69,7 @@ class Driver:
     ) -> None:
         path = folder / "sweep.yaml"
         path.write_text(yaml.safe_dump(content, sort_keys=False))
-        config = load_sweep(path, storage=str(folder / "results"))
+        config = load_config(path, storage=str(folder / "results"))
         plan = make_plan(config)
         self.sweep: OpenSweep = open_sweep(config, plan, config.storage)
         self.computed: list[str] = []

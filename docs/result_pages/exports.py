@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 
 from music_rllib import names
-from music_rllib.config.load import load_sweep
+from music_rllib.config.load import load_config
 from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment.plan import Node, Plan, make_plan
 from music_rllib.results.archive import (
@@ -43,7 +43,7 @@ def config_of(name: str) -> SweepConfig | None:
     files = sorted(CONFIGS.glob("**/*.yaml"))
     found = (file for file in files if f"name: {name}\n" in file.read_text("utf-8"))
     file = next(found, None)
-    return load_sweep(file) if file else None
+    return load_config(file) if file else None
 
 
 @cache

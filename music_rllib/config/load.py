@@ -1,6 +1,6 @@
 """Reads and validates a sweep's YAML file before anything starts.
 
-:func:`load_sweep` reports all problems at once, each as ``file:line: key rule, got value``. The
+:func:`load_config` reports all problems at once, each as ``file:line: key rule, got value``. The
 sweep that it returns is resolved: each stage has the complete settings of a run for each point of
 its grid and each task.
 """
@@ -33,7 +33,7 @@ from music_rllib.limits import MOST_RUNS, MOST_SEEDS
 from music_rllib.store.storage import expanded
 
 
-def load_sweep(
+def load_config(
     path: str | Path,
     *,
     name: str | None = None,

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from music_rllib.command_line import plain
-from music_rllib.config.load import load_sweep
+from music_rllib.config.load import load_config
 from music_rllib.config.problems import shown
 from music_rllib.config.schema import SweepConfig
 from music_rllib.errors import BadInputError
@@ -119,7 +119,7 @@ class SweepLocation:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder, f"{self.name}.json")
             path.write_text(as_json(self.document()), encoding="utf-8")
-            return load_sweep(path, storage=self.storage, seeds=seeds)
+            return load_config(path, storage=self.storage, seeds=seeds)
 
 
 # Finding sweeps -----------------------------------------------------------------------------------
@@ -149,7 +149,7 @@ def _locate(place: str, storage: str | None) -> SweepLocation:
     if folder is not None:
         return SweepLocation(storage=str(folder.parent), name=folder.name)
     if place.endswith((".yaml", ".yml")):
-        config = load_sweep(place, storage=storage)
+        config = load_config(place, storage=storage)
         return SweepLocation(storage=resolve_storage(config.storage)[0], name=config.name)
     place = place.rstrip("/")
     if storage is None and "://" in place:

@@ -16,7 +16,7 @@ from typing import Any
 from rich.console import Console
 
 from music_rllib.command_line import console_for, how_to_continue, print_json
-from music_rllib.config.load import load_sweep, warnings_of
+from music_rllib.config.load import load_config, warnings_of
 from music_rllib.config.schema import MlflowSettings, SweepConfig
 from music_rllib.envs.tasks import search_in
 from music_rllib.errors import BadInputError
@@ -71,7 +71,7 @@ def load(
     """
     path = path or DEFAULT_CONFIG
     search_in(path.parent)
-    return load_sweep(path, name=name, storage=storage, seeds=seeds, overrides=overrides)
+    return load_config(path, name=name, storage=storage, seeds=seeds, overrides=overrides)
 
 
 def plan(config: SweepConfig, *, measure: bool = False, as_json: bool = False) -> int:

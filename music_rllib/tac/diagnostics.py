@@ -27,7 +27,7 @@ from music_rllib.functional.distribution import (
     ln_q_of_policy,
 )
 from music_rllib.replay.trajectories import Trajectory
-from music_rllib.tac.objective import Objective
+from music_rllib.tac.losses import TACLoss
 from music_rllib.tac.rl_module import TACModule
 
 
@@ -149,7 +149,7 @@ def critic_bias(
     fresh: FreshEpisodes,
     rewards: Tensor,
     module: TACModule,
-    objective: Objective,
+    objective: TACLoss,
     noise: Mapping[str, Tensor],
 ) -> float:
     """Mean over episodes of the critics' value of the first step minus the realized return.

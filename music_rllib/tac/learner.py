@@ -33,9 +33,9 @@ from music_rllib.schedules import Quantity
 from music_rllib.tac import diagnostics
 from music_rllib.tac.compiled_update import CompiledUpdate, FusedAdam, needs_autograd, use_threads
 from music_rllib.tac.diagnostics import FreshEpisodes, critic_bias
+from music_rllib.tac.losses import Losses, ScheduledSettings, TACLoss
 from music_rllib.tac.minibatches import Minibatch, Minibatches
 from music_rllib.tac.networks import RunningNormaliser
-from music_rllib.tac.objective import Losses, Objective, ScheduledSettings
 from music_rllib.tac.rl_module import ESTIMATOR_MODULE, TACForward, TACModule
 
 GRAD_UPDATES = "grad_updates"
@@ -63,7 +63,7 @@ class TACLearner(TorchLearner):
         music, budget = self.config.settings.music, self.config.total_env_steps or 0
         actions = self._policy_module.action_size
         self._now = ScheduledSettings(self._settings, music, budget, actions)
-        self._objective = Objective(self._settings, self._policy_module, self._now)
+        self._objective = TACLoss(self._settings, self._policy_module, self._now)
         pairs = self._policy_module.get_target_network_pairs()
         self._online: list[Tensor] = [p for online, _ in pairs for p in online.parameters()]
         self._targets: list[Tensor] = [p for _, target in pairs for p in target.parameters()]

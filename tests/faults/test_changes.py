@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import yaml
 
-from music_rllib.config.load import load_sweep
+from music_rllib.config.load import load_config
 from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment.open_sweep import OpenSweep, open_sweep
 from music_rllib.experiment.plan import continuation_key, make_plan
@@ -29,7 +29,7 @@ RESULT = RunResult(label="l", env_steps=1200, seconds=1.0, metrics={})
 def opened(folder: Path, document: dict[str, Any]) -> OpenSweep:
     path = folder / "sweep.yaml"
     path.write_text(yaml.safe_dump(document, sort_keys=False))
-    config: SweepConfig = load_sweep(path)
+    config: SweepConfig = load_config(path)
     storage = folder / "results"
     return open_sweep(config, make_plan(config), str(storage))
 

@@ -28,7 +28,7 @@ from cluster.check import (
     read_crds,
     strings,
 )
-from music_rllib.config.load import load_sweep
+from music_rllib.config.load import load_config
 
 ROOT = Path(__file__).parents[2]
 CLUSTER = ROOT / "cluster"
@@ -447,8 +447,8 @@ def test_versions_agree() -> None:
 def test_sweeps_that_the_files_name_are_there() -> None:
     entrypoint = load(JOB)["spec"]["entrypoint"]
     (inside,) = re.findall(r"/opt/music_rllib/(\S+\.yaml)", entrypoint)
-    assert load_sweep(ROOT / inside).stages
-    sweep = load_sweep(CLUSTER / "sweep.yaml")
+    assert load_config(ROOT / inside).stages
+    sweep = load_config(CLUSTER / "sweep.yaml")
     assert sweep.storage == "/results"
     assert sweep.mlflow.tracking_uri == "http://mlflow:5000"
 

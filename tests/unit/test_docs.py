@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from music_rllib import names
-from music_rllib.config.load import load_sweep
+from music_rllib.config.load import load_config
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.results.analysis_plan import analysis_plan
 
@@ -34,7 +34,7 @@ EXAMPLES = [
 def test_sweeps_in_the_documentation_are_valid(example: str, tmp_path: Path) -> None:
     path = tmp_path / "example.yaml"
     path.write_text(example, encoding="utf-8")
-    assert load_sweep(path).stages
+    assert load_config(path).stages
 
 
 def anchors(text: str) -> set[str]:
@@ -106,7 +106,7 @@ def test_every_page_is_on_the_documentation_site() -> None:
     "study", ["q_entropy_factorial", "claims_push", "claims_pick_and_place", "claims_slide"]
 )
 def test_the_plan_of_the_claims_is_that_of_their_sweeps(study: str) -> None:
-    plan = analysis_plan(load_sweep(ROOT / "tune_configs" / f"{study}.yaml"))
+    plan = analysis_plan(load_config(ROOT / "tune_configs" / f"{study}.yaml"))
     assert plan is not None
     (row,) = [
         line

@@ -18,7 +18,7 @@ from typer.main import get_command
 
 from music_rllib import __version__
 from music_rllib.config.document import SCHEMA
-from music_rllib.config.load import load_sweep
+from music_rllib.config.load import load_config
 from music_rllib.program import app, main
 
 REPOSITORY = Path(__file__).parents[2]
@@ -154,14 +154,14 @@ def test_init_writes_a_valid_sweep_and_overwrites_nothing(
     assert main(["init", "my reach.yaml"]) == 0
     assert main(["plan", "my reach.yaml", "seeds=2"]) == 0
     assert "6 runs, 60,000 env steps in total" in capsys.readouterr().out
-    assert load_sweep("my reach.yaml").name == "my_reach"
+    assert load_config("my reach.yaml").name == "my_reach"
     # The other sweep that its comments show.
     text = Path("my reach.yaml").read_text()
     kept, _, other = text.partition("# With MUSIC")
     shown = [line.removeprefix("#").removeprefix(" ") for line in other.splitlines()[2:]]
     document = yaml.safe_load(kept) | yaml.safe_load("\n".join(shown))
     Path("other.yaml").write_text(yaml.safe_dump(document))
-    assert [stage.name for stage in load_sweep("other.yaml").stages] == ["pretrain", "finetune"]
+    assert [stage.name for stage in load_config("other.yaml").stages] == ["pretrain", "finetune"]
     assert main(["init", "my reach.yaml"]) == 2
     assert "must not exist yet" in capsys.readouterr().err
     assert Path("my reach.yaml").read_text() == text
@@ -189,7 +189,7 @@ def test_init_writes_a_valid_name_and_command(
     assert main(["init", file]) == 0
     command = shlex.split(capsys.readouterr().out.partition("Check it with: ")[2])
     assert command == ["music-rllib", "plan", file]
-    assert load_sweep(file).name == name
+    assert load_config(file).name == name
     assert f"#   music-rllib run {shlex.quote(file)} " in Path(file).read_text()
 
 

@@ -20,7 +20,7 @@ import pytest
 import typer
 import yaml
 
-from music_rllib.config.load import load_sweep
+from music_rllib.config.load import load_config
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -180,7 +180,7 @@ def test_yaml_is_a_sweep_or_a_part_of_the_one_before_it(page: Path, tmp_path: Pa
             text = yaml.safe_dump(sweep, sort_keys=False)
         path = tmp_path / "sweep.yaml"
         path.write_text(text, encoding="utf-8")
-        assert load_sweep(path).stages
+        assert load_config(path).stages
 
 
 @pytest.mark.parametrize("block", snippets("python"))

@@ -15,7 +15,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from music_rllib import names
-from music_rllib.config.load import load_sweep
+from music_rllib.config.load import load_config
 from music_rllib.experiment.open_sweep import open_sweep
 from music_rllib.experiment.plan import Node, make_plan
 from music_rllib.experiment.record import keep_record
@@ -122,7 +122,7 @@ def values(node: Node, step: int) -> dict[str, float]:
 def nodes(tmp_path_factory: pytest.TempPathFactory) -> list[Node]:
     file = tmp_path_factory.mktemp("config") / "tiny.yaml"
     file.write_text(CONFIG)
-    return list(make_plan(load_sweep(file)).nodes)
+    return list(make_plan(load_config(file)).nodes)
 
 
 @pytest.fixture(scope="module")
@@ -131,7 +131,7 @@ def sweep_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     storage = tmp_path_factory.mktemp("results")
     file = storage / "tiny.yaml"
     file.write_text(CONFIG)
-    config = load_sweep(file, storage=str(storage))
+    config = load_config(file, storage=str(storage))
     sweep = open_sweep(config, make_plan(config), str(storage))
     keep_record(sweep)
     with StateFile(sweep) as state_file:

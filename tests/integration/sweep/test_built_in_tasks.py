@@ -16,7 +16,7 @@ import pytest
 from numpy.typing import NDArray
 
 from music_rllib import names
-from music_rllib.config.load import load_sweep
+from music_rllib.config.load import load_config
 from music_rllib.config.run_settings import Evaluation, RunSettings, Variant, variant_music
 from music_rllib.envs.make import goal_reward_of, make_env
 from music_rllib.envs.tasks import BUILT_IN_TASKS, Task
@@ -234,7 +234,7 @@ def test_the_declarations_of_the_page_fit_their_environments(tmp_path: Path) -> 
     path = tmp_path / "example.yaml"
     for example in re.findall(r"^```yaml\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE):
         path.write_text(example, encoding="utf-8")
-        check_environments(make_plan(load_sweep(path)))
+        check_environments(make_plan(load_config(path)))
 
 
 # --- training ----------------------------------------------------------------------------------

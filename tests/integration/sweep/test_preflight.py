@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import yaml
 
-from music_rllib.config.load import load_sweep
+from music_rllib.config.load import load_config
 from music_rllib.experiment.plan import make_plan
 from music_rllib.sweep.preflight import TaskError, check_environments
 from tests.integration.conftest import ENVIRONMENTS
@@ -34,7 +34,7 @@ def check(folder: Path, *tasks: dict[str, Any], **replay: Any) -> list[str]:
     }
     path = folder / "sweep.yaml"
     path.write_text(yaml.safe_dump(document))
-    return check_environments(make_plan(load_sweep(path)))
+    return check_environments(make_plan(load_config(path)))
 
 
 MISFITS: list[tuple[dict[str, Any], str]] = [

@@ -14,7 +14,7 @@ from mlflow import MlflowClient
 from typer.testing import CliRunner
 
 from music_rllib import names
-from music_rllib.config.load import load_sweep
+from music_rllib.config.load import load_config
 from music_rllib.experiment.open_sweep import open_sweep
 from music_rllib.experiment.plan import make_plan
 from music_rllib.experiment.record import keep_record
@@ -38,7 +38,7 @@ def log_published_sweep(folder: Path) -> str:
     sweep = read_archive(REPOSITORY / "docs" / "results" / "data" / NAME)
     file = folder / "sweep.yaml"
     file.write_text(str(sweep.config))
-    config = load_sweep(file)
+    config = load_config(file)
     plan = make_plan(config)
     of_seed = {(run.entropic_index, run.seed): number for number, run in enumerate(sweep.runs)}
     opened = open_sweep(config, plan, str(folder))

@@ -81,7 +81,7 @@ def test_a_password_in_the_tracking_uri_is_not_kept(
     sweep_program: Any, sweep_document: dict[str, Any], tmp_path: Path
 ) -> None:
     """It should be in the environment; where it is not, the copy of the file leaves it out."""
-    from music_rllib.config.load import load_sweep
+    from music_rllib.config.load import load_config
     from music_rllib.experiment.open_sweep import open_sweep
     from music_rllib.experiment.plan import make_plan
     from music_rllib.experiment.record import keep_record
@@ -91,7 +91,7 @@ def test_a_password_in_the_tracking_uri_is_not_kept(
     del document["environments"], document["resources"]
     document["tasks"] = ["FetchPush"]
     sweep_program.write(document)
-    config = load_sweep(tmp_path / "sweep.yaml")
+    config = load_config(tmp_path / "sweep.yaml")
     storage = tmp_path / "kept"
     opened = open_sweep(config, make_plan(config), str(storage))
     keep_record(opened)

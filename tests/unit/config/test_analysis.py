@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import yaml
 
-from music_rllib.config.load import load_sweep
+from music_rllib.config.load import load_config
 from music_rllib.config.problems import ConfigError
 from music_rllib.config.schema import Hypothesis
 
@@ -39,7 +39,7 @@ def problems(tmp_path: Path) -> Problems:
         document = {"name": "n", "tasks": ["FetchPush"], "stages": stages}
         path.write_text(yaml.safe_dump(document | {"analysis": {"hypotheses": [hypothesis]}}))
         try:
-            load_sweep(path)
+            load_config(path)
         except ConfigError as error:
             return list(error.lines)
         return []

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
-from music_rllib.config.load import load_sweep
+from music_rllib.config.load import load_config
 from music_rllib.config.problems import ConfigError
 from music_rllib.config.run_settings import RunSettings, handed_over, variant_music
 from music_rllib.config.schema import SweepConfig
@@ -43,7 +43,7 @@ def load(tmp_path: Path) -> Callable[..., SweepConfig]:
     def load_document(document: Document, **options: str) -> SweepConfig:
         path = tmp_path / "sweep.yaml"
         path.write_text(yaml.safe_dump(document, sort_keys=False))
-        return load_sweep(path, **options)
+        return load_config(path, **options)
 
     return load_document
 

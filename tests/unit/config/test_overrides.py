@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from music_rllib.config.load import load_sweep
+from music_rllib.config.load import load_config
 from music_rllib.config.problems import ConfigError
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.schema import SweepConfig
@@ -31,7 +31,7 @@ stages:
 def load(folder: Path, *arguments: str, text: str = SWEEP) -> SweepConfig:
     path = folder / "sweep.yaml"
     path.write_text(text)
-    return load_sweep(path, overrides=arguments)
+    return load_config(path, overrides=arguments)
 
 
 def runs(config: SweepConfig) -> list[RunSettings]:
@@ -54,12 +54,12 @@ def test_overrides_equal_an_edited_file(tmp_path: Path) -> None:
         .replace("name: mine", "name: other")
         .replace("tac: {alpha", "env_steps: 70000\n    tac: {alpha")
     )
-    assert runs(config) == runs(load_sweep(path))
+    assert runs(config) == runs(load_config(path))
     # What the sweep's folder keeps makes the same sweep again.
     kept = tmp_path / "config.json"
     kept.write_text(json.dumps(config.document))
-    assert runs(load_sweep(kept)) == runs(config)
-    assert load_sweep(kept).seeds == config.seeds
+    assert runs(load_config(kept)) == runs(config)
+    assert load_config(kept).seeds == config.seeds
 
 
 def test_values_inside_a_setting_and_a_grid(tmp_path: Path) -> None:
@@ -237,7 +237,7 @@ def test_each_mistake_of_a_file_is_reported_once(tmp_path: Path, text: str, mess
     stage = "{name: a, variant: tac, grid: {tac.entropic_index: [1, 2, 3], tac.tau: [.1, .2]}}"
     path.write_text(f"name: mine\ntasks: [FetchReach]\n{text}\nstages: [{stage}]\n")
     with pytest.raises(ConfigError) as refusal:
-        load_sweep(path)
+        load_config(path)
     (line,) = refusal.value.lines
     assert message in line
 
@@ -247,7 +247,7 @@ def test_an_unknown_key_of_a_grid_is_one_mistake(tmp_path: Path) -> None:
     stage = "{name: a, variant: tac, grid: {q: [1, 2, 3], tac.gamma: [0.9, 1.5, 2]}}"
     path.write_text(f"name: mine\ntasks: [FetchReach]\nstages: [{stage}]\n")
     with pytest.raises(ConfigError) as refusal:
-        load_sweep(path)
+        load_config(path)
     assert list(refusal.value.lines) == [
         "sweep.yaml:3: stages.a.grid.q is not a known setting (did you mean 'tac.entropic_index'?)",
         "sweep.yaml:3: stages.a.grid.tac.gamma[1] must be < 1, got 1.5",

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from music_rllib.config.document import SHIPPED, shipped_presets
-from music_rllib.config.load import load_sweep
+from music_rllib.config.load import load_config
 from music_rllib.config.problems import ConfigError
 from music_rllib.functional.actor_critic import critic_target
 from tests.unit.functional.entropies import gaussian_entropy, joint_entropy
@@ -34,7 +34,7 @@ def sweep(folder: Path, preset: str, content: str | None = None) -> Path:
 
 def test_settings_of_the_sweep_replace_the_preset(tmp_path: Path) -> None:
     preset = "env_steps: 9000\nnum_envs: 3\ntac: {lr: 0.1, gamma: 0.5, tau: 0.25}\n"
-    config = load_sweep(sweep(tmp_path, "mine", preset))
+    config = load_config(sweep(tmp_path, "mine", preset))
     pretrain, finetune = (stage.points[0].runs["FetchPush"] for stage in config.stages)
     assert (pretrain.env_steps, pretrain.num_envs) == (123456, 3)
     assert (pretrain.tac.lr, pretrain.tac.gamma, pretrain.tac.tau) == (0.0005, 0.9, 0.25)
@@ -42,19 +42,19 @@ def test_settings_of_the_sweep_replace_the_preset(tmp_path: Path) -> None:
 
 
 def test_hindsight_of_a_preset_does_not_reach_music_u(tmp_path: Path) -> None:
-    config = load_sweep(sweep(tmp_path, "mine", "replay: {hindsight_k: 4}"))
+    config = load_config(sweep(tmp_path, "mine", "replay: {hindsight_k: 4}"))
     pretrain, finetune = (stage.points[0].runs["FetchPush"] for stage in config.stages)
     assert (pretrain.replay.hindsight_k, finetune.replay.hindsight_k) == (0, 4)
     path = tmp_path / "sweep.yaml"
     own = path.read_text().replace("tac: {gamma: 0.9}", "replay: {hindsight_k: 4}")
     path.write_text(own)
     with pytest.raises(ConfigError, match=r"pretrain.replay.hindsight_k has no effect with"):
-        load_sweep(path)
+        load_config(path)
 
 
 @pytest.mark.parametrize("preset", sorted(path.stem for path in SHIPPED.glob("*.yaml")))
 def test_every_shipped_preset_is_valid(preset: str, tmp_path: Path) -> None:
-    config = load_sweep(sweep(tmp_path, preset))
+    config = load_config(sweep(tmp_path, preset))
     assert all(point.runs for stage in config.stages for point in stage.points)
 
 
@@ -76,7 +76,7 @@ def test_mistakes_of_a_preset_have_its_file_and_line(
     preset: str, content: str | None, message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(ConfigError, match=message):
-        load_sweep(sweep(tmp_path, preset, content))
+        load_config(sweep(tmp_path, preset, content))
 
 
 def test_presets_are_listed_with_their_descriptions() -> None:
@@ -89,10 +89,10 @@ def test_presets_are_listed_with_their_descriptions() -> None:
 
 def test_a_users_preset_replaces_a_shipped_preset(tmp_path: Path) -> None:
     path = sweep(tmp_path, "small")
-    assert load_sweep(path).stages[0].points[0].runs["FetchPush"].num_envs == 4
+    assert load_config(path).stages[0].points[0].runs["FetchPush"].num_envs == 4
     (tmp_path / "presets").mkdir()
     (tmp_path / "presets" / "small.yaml").write_text("num_envs: 7")
-    assert load_sweep(path).stages[0].points[0].runs["FetchPush"].num_envs == 7
+    assert load_config(path).stages[0].points[0].runs["FetchPush"].num_envs == 7
 
 
 ORIGINAL_MUSIC = {
@@ -162,7 +162,7 @@ def test_presets_have_the_numbers_of_the_originals(preset: str, tmp_path: Path) 
     path.write_text(
         path.read_text().partition("defaults")[0] + "stages: [{name: u, variant: music-u}]"
     )
-    run = load_sweep(path).stages[0].points[0].runs["FetchPush"]
+    run = load_config(path).stages[0].points[0].runs["FetchPush"]
     for setting, number in ORIGINALS[preset].items():
         found = attrgetter(setting)(run)
         assert found == (pytest.approx(number) if isinstance(number, float | tuple) else number)
@@ -173,12 +173,12 @@ SWEEPS = sorted((Path(__file__).parents[3] / "tune_configs").rglob("*.yaml"))
 
 @pytest.mark.parametrize("path", SWEEPS, ids=lambda path: path.stem)
 def test_every_shipped_sweep_is_valid(path: Path) -> None:
-    assert load_sweep(path).stages
+    assert load_config(path).stages
 
 
 def test_music_2021_learns_from_the_intrinsic_reward_of_music_r(tmp_path: Path) -> None:
     """Targets are iterated to where they end if every step pays -1, and if every step pays -2."""
-    finetune = load_sweep(sweep(tmp_path, "music-2021")).stages[1].points[0].runs["FetchPush"].tac
+    finetune = load_config(sweep(tmp_path, "music-2021")).stages[1].points[0].runs["FetchPush"].tac
     values = torch.zeros(2, dtype=torch.float64)
     for _ in range(3000):
         values = critic_target(

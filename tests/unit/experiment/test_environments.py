@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import yaml
 
-from music_rllib.config.load import load_sweep
+from music_rllib.config.load import load_config
 from music_rllib.envs.fingerprint import Fingerprint
 from music_rllib.errors import BadInputError
 from music_rllib.experiment.environments import (
@@ -55,7 +55,7 @@ def opened(folder: Path, environment: Fingerprint, name: str = "s", **defaults: 
     }
     path = folder / "sweep.yaml"
     path.write_text(yaml.safe_dump(document))
-    config, storage = load_sweep(path), str(folder / "results")
+    config, storage = load_config(path), str(folder / "results")
     environments = {"Lab": environment, "Field": {"source field.py": "f"}}
     return open_sweep(config, make_plan(config), storage, environments=environments)
 

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import yaml
 
-from music_rllib.config.load import load_sweep
+from music_rllib.config.load import load_config
 from music_rllib.config.problems import ConfigError
 from music_rllib.config.run_settings import RunSettings, variant_music
 from music_rllib.envs.tasks import BUILT_IN_TASKS
@@ -29,7 +29,7 @@ def plan(tmp_path: Path, **document: Any) -> Plan:
     path = tmp_path / "sweep.yaml"
     base = {"name": "s", "tasks": ["FetchPush"], "defaults": {"env_steps": 6000}}
     path.write_text(yaml.safe_dump(base | document, sort_keys=False))
-    return make_plan(load_sweep(path))
+    return make_plan(load_config(path))
 
 
 def test_pretrain_then_finetune(tmp_path: Path) -> None:
@@ -186,7 +186,7 @@ def test_keys_are_the_same_on_another_machine(tmp_path: Path) -> None:
     """
     sweep = plan(tmp_path, stages=[PRETRAIN, FINETUNE])
     assert {node.label: node.key for node in sweep.nodes} == KEYS
-    earlier = make_plan(load_sweep(tmp_path / "sweep.yaml"), algorithm="2")
+    earlier = make_plan(load_config(tmp_path / "sweep.yaml"), algorithm="2")
     assert {node.label: node.key for node in earlier.nodes} == KEYS_OF_VERSION_2
 
 

@@ -8,7 +8,7 @@ import pytest
 import yaml
 from ray.tune.search import Searcher
 
-from music_rllib.config.load import load_sweep
+from music_rllib.config.load import load_config
 from music_rllib.experiment.plan import Plan, make_plan
 from music_rllib.experiment.scheduler import Scheduler, Status
 from music_rllib.tune.runner import DagSearcher
@@ -29,7 +29,7 @@ def plan_of(folder: Path, stages: list[dict[str, Any]]) -> Plan:
     path = folder / "s.yaml"
     document = {"name": "s", "tasks": ["FetchPush"], "seeds": [0, 1], "stages": stages}
     path.write_text(yaml.safe_dump(document))
-    return make_plan(load_sweep(path))
+    return make_plan(load_config(path))
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import numpy as np
 
 from docs.result_pages.exports import of_plan
 from music_rllib import names
-from music_rllib.config.load import load_sweep
+from music_rllib.config.load import load_config
 from music_rllib.experiment.plan import make_plan
 from music_rllib.results.analysis_plan import AnalysisPlan, with_plan
 from music_rllib.results.archive import merged
@@ -98,7 +98,7 @@ def test_runs_of_a_plan_are_found_in_exports_of_other_sweeps(tmp_path: Path) -> 
         "{name: mine, tasks: [FetchPush], seeds: [0, 1, 2], "
         "stages: [{name: first, variant: tac, grid: {tac.entropic_index: [1.0, 2.0]}}]}"
     )
-    plan = make_plan(load_sweep(file))
+    plan = make_plan(load_config(file))
     keys = [node.key for node in plan.nodes]
     exports = [
         sweep(("other", "FINISHED", [9]), (keys[4], "FINISHED", [1, 2]), (keys[0], "KILLED", [3])),
@@ -123,7 +123,7 @@ def test_runs_of_an_earlier_algorithm_replace_missing_ones(
         "{name: mine, tasks: [FetchPush], seeds: [0, 1], stages: [{name: u, variant: music-u},"
         " {name: r, variant: music-r, init_from: u}]}"
     )
-    plan, earlier = make_plan(load_sweep(file)), make_plan(load_sweep(file), algorithm="2")
+    plan, earlier = make_plan(load_config(file)), make_plan(load_config(file), algorithm="2")
     now, before = ([node.key for node in one.nodes] for one in (plan, earlier))
     assert not set(now) & set(before)
     exports = [

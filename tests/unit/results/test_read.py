@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 import yaml
 
-from music_rllib import load_sweep as load_frames
-from music_rllib import names
-from music_rllib.config.load import load_sweep
+from music_rllib import load_sweep, names
+from music_rllib.config.load import load_config
 from music_rllib.experiment.open_sweep import OpenSweep, open_sweep
 from music_rllib.experiment.plan import Node, make_plan
 from music_rllib.experiment.record import keep_record
@@ -70,7 +69,7 @@ def opened_sweep(
     }
     file = folder / "s.yaml"
     file.write_text(yaml.safe_dump(content))
-    config = load_sweep(file, storage=str(folder / "results"))
+    config = load_config(file, storage=str(folder / "results"))
     opened = open_sweep(config, make_plan(config), config.storage)
     keep_record(opened)
     return opened
@@ -127,7 +126,7 @@ class Shown:
         assert main(["best", self.place, "--json"]) == 0
         self.best = json.loads(capsys.readouterr().out)
         self.read = read_sweep(self.place).sweep
-        self.frames = load_frames(self.place)
+        self.frames = load_sweep(self.place)
 
     def _json(self, capsys: pytest.CaptureFixture[str], command: str) -> Any:
         assert main([command, self.place, "--json"]) == 0

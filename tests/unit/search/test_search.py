@@ -15,7 +15,7 @@ import yaml
 from pydantic import ValidationError
 
 from music_rllib import names
-from music_rllib.config.load import load_sweep, warnings_of
+from music_rllib.config.load import load_config, warnings_of
 from music_rllib.config.problems import ConfigError
 from music_rllib.config.search import Objective, Pruning, Rung, SearchSettings
 from music_rllib.search.new_study import fits
@@ -113,7 +113,7 @@ def test_the_spread_counts_each_seed_of_a_trial_once() -> None:
 
 @pytest.mark.parametrize("name", ["search", "compare"])
 def test_the_packaged_examples_are_valid(name: str) -> None:
-    config = load_sweep(Path(__file__).parents[3] / f"tune_configs/{name}.yaml")
+    config = load_config(Path(__file__).parents[3] / f"tune_configs/{name}.yaml")
     settings = config.stages[-1].search
     assert settings is not None
     assert settings.mode == name
@@ -354,7 +354,7 @@ def test_mistakes_in_a_search_are_named(search: Document, message: str, tmp_path
     path = tmp_path / "sweep.yaml"
     path.write_text(yaml.safe_dump(document(search), sort_keys=False))
     with pytest.raises(ConfigError) as error:
-        load_sweep(path)
+        load_config(path)
     assert message in str(error.value)
     assert "sweep.yaml:" in str(error.value)
 
@@ -373,7 +373,7 @@ def test_a_mistake_in_the_objective_is_one_error(
     path = tmp_path / "sweep.yaml"
     path.write_text(yaml.safe_dump(document({"objective": objective})))
     with pytest.raises(ConfigError) as error:
-        load_sweep(path)
+        load_config(path)
     (line,) = error.value.lines
     assert message in line
 
@@ -389,13 +389,13 @@ def test_success_needs_a_task_that_declares_it(objective: Any, tmp_path: Path) -
     path = tmp_path / "sweep.yaml"
     path.write_text(yaml.safe_dump(content))
     with pytest.raises(ConfigError) as error:
-        load_sweep(path)
+        load_config(path)
     (line,) = error.value.lines
     assert "metric must be a metric that Swing has too, which declares no success" in line
     assert "write objective: {metric: evaluation/episode_return}, got" in line
     content["stages"][0]["search"]["objective"] = {"metric": names.EVAL_RETURN}
     path.write_text(yaml.safe_dump(content))
-    load_sweep(path)
+    load_config(path)
 
 
 def test_a_rung_may_exceed_the_budget_of_shorter_tasks(tmp_path: Path) -> None:
@@ -404,11 +404,11 @@ def test_a_rung_may_exceed_the_budget_of_shorter_tasks(tmp_path: Path) -> None:
     content["stages"][1]["per_task"] = {"FetchSlide": {"env_steps": 6000}}
     path = tmp_path / "sweep.yaml"
     path.write_text(yaml.safe_dump(content))
-    load_sweep(path)
+    load_config(path)
     content["stages"][1]["per_task"]["FetchSlide"]["env_steps"] = 4500
     path.write_text(yaml.safe_dump(content))
     with pytest.raises(ConfigError, match="must be <= 4500"):
-        load_sweep(path)
+        load_config(path)
 
 
 Q = {"float": [1.0, 2.0], "step": 0.25}
@@ -468,7 +468,7 @@ def test_no_point_is_tried_twice(sampler: str, space: Document, trials: int) -> 
 def test_a_search_with_few_points_prints_where_it_ends(tmp_path: Path) -> None:
     path = tmp_path / "sweep.yaml"
     path.write_text(yaml.safe_dump(document({"space": CHOICES, "trials": 20})))
-    (line,) = warnings_of(load_sweep(path))
+    (line,) = warnings_of(load_config(path))
     assert line == (
         "finetune: search.trials is 20, and the space has 9 points: the search ends after 9 trials"
     )

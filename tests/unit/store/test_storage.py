@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from music_rllib.config.load import load_sweep
+from music_rllib.config.load import load_config
 from music_rllib.config.problems import ConfigError
 from music_rllib.store import storage as storage_module
 from music_rllib.store.storage import (
@@ -89,7 +89,7 @@ def test_unknown_homes_and_invalid_text_are_refused() -> None:
     with pytest.raises(StorageError, match="home that is known, got '~nobody-at-all/x'"):
         resolve_storage("~nobody-at-all/x")
     with pytest.raises(ConfigError, match=r"^--storage must be UTF-8 text, got '\\udcff'$"):
-        load_sweep(DEFAULT_CONFIG, storage=os.fsdecode(b"\xff"))
+        load_config(DEFAULT_CONFIG, storage=os.fsdecode(b"\xff"))
 
 
 def test_a_bucket_that_does_not_answer_times_out(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,7 +17,7 @@ import yaml
 from fsspec.implementations.memory import MemoryFileSystem  # type: ignore[import-untyped]
 
 from music_rllib import names
-from music_rllib.config.load import load_sweep
+from music_rllib.config.load import load_config
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.experiment import open_sweep as open_sweep_module
 from music_rllib.experiment import sweep_files
@@ -111,7 +111,7 @@ def program(capsys: pytest.CaptureFixture[str]) -> Program:
 def opened(storage: str, tmp_path: Path, **changes: Any) -> OpenSweep:
     path = tmp_path / "sweep.yaml"
     path.write_text(yaml.safe_dump(SWEEP | changes))
-    config = load_sweep(path, storage=storage)
+    config = load_config(path, storage=storage)
     sweep = open_sweep(config, make_plan(config), storage)
     keep_record(sweep)
     return sweep
@@ -264,12 +264,12 @@ def test_best_takes_the_middle_run_of_the_best_condition(
 )
 def test_what_best_writes_is_the_run_to_the_last_setting(name: str, tmp_path: Path) -> None:
     file = driver.DEFAULT_CONFIG if name == "default" else Path("tune_configs", f"{name}.yaml")
-    config = load_sweep(REPOSITORY / file, storage=str(tmp_path))
+    config = load_config(REPOSITORY / file, storage=str(tmp_path))
     sweep = open_sweep(config, make_plan(config), str(tmp_path))
     for key in {(node.stage, node.run.task.name): node.key for node in sweep.plan.nodes}.values():
         path = tmp_path / "run.yaml"
         path.write_text(yaml.safe_dump(sweep_of_run(sweep, key, tmp_path)))
-        assert make_plan(load_sweep(path)).nodes[-1].key == key
+        assert make_plan(load_config(path)).nodes[-1].key == key
 
 
 def test_a_condition_with_all_its_runs_is_better_than_a_lucky_one(
@@ -452,7 +452,7 @@ def resolved(document: dict[str, Any], tmp_path: Path) -> RunSettings:
     """Settings of the first run."""
     path = tmp_path / "resolved.yaml"
     path.write_text(yaml.safe_dump(document))
-    return next(iter(load_sweep(path).stages[0].points[0].runs.values()))
+    return next(iter(load_config(path).stages[0].points[0].runs.values()))
 
 
 def test_a_sweep_goes_on_from_the_handoff_in_its_storage(

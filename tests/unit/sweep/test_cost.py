@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import yaml
 
-from music_rllib.config.load import load_sweep
+from music_rllib.config.load import load_config
 from music_rllib.experiment.plan import make_plan
 from music_rllib.runtime import machine
 from music_rllib.sweep import cost
@@ -30,7 +30,7 @@ def kinds(folder: Path, finished: int = 0, **changes: Any) -> list[RunGroup]:
     }
     path = folder / "s.yaml"
     path.write_text(yaml.safe_dump(document | changes))
-    config = load_sweep(path)
+    config = load_config(path)
     plan = make_plan(config)
     return run_groups(config, plan, {node.key for node in plan.nodes[:finished]})
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 import yaml
 
-from music_rllib.config.load import load_sweep
+from music_rllib.config.load import load_config
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.runtime.ray_cluster import Capacity
 from music_rllib.sweep.preflight import (
@@ -31,7 +31,7 @@ def run(tmp_path: Any, **defaults: Any) -> RunSettings:
     }
     path = tmp_path / "sweep.yaml"
     path.write_text(yaml.safe_dump(document))
-    return load_sweep(path).stages[0].points[0].runs["FetchPush"]
+    return load_config(path).stages[0].points[0].runs["FetchPush"]
 
 
 @pytest.mark.parametrize(

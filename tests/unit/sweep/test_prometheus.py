@@ -9,7 +9,7 @@ import ray.util.metrics
 import yaml
 
 from music_rllib import names
-from music_rllib.config.load import load_sweep
+from music_rllib.config.load import load_config
 from music_rllib.experiment.plan import Plan, make_plan
 from music_rllib.experiment.scheduler import Scheduler
 from music_rllib.store.history import Report, RunResult
@@ -47,7 +47,7 @@ def plan(tmp_path: Path) -> Plan:
         "stages": [{"name": "train", "variant": "tac"}],
     }
     (tmp_path / "s.yaml").write_text(yaml.safe_dump(document))
-    return make_plan(load_sweep(tmp_path / "s.yaml"))
+    return make_plan(load_config(tmp_path / "s.yaml"))
 
 
 def report(env_steps: int, success: float) -> Report:

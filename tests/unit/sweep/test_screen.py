@@ -12,7 +12,7 @@ from rich.console import Console, RenderableType
 
 from music_rllib import names
 from music_rllib.command_line import clock, percent
-from music_rllib.config.load import load_sweep
+from music_rllib.config.load import load_config
 from music_rllib.config.schema import SweepConfig
 from music_rllib.config.tac_settings import LearnedAlpha, setting_text
 from music_rllib.experiment.plan import Plan, make_plan
@@ -46,7 +46,7 @@ DOCUMENT: dict[str, Any] = {
 def loaded(folder: Path, **changes: Any) -> SweepConfig:
     path = folder / "s.yaml"
     path.write_text(yaml.safe_dump(DOCUMENT | changes, sort_keys=False))
-    return load_sweep(path)
+    return load_config(path)
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 
 from music_rllib import names
-from music_rllib.config.load import load_sweep
+from music_rllib.config.load import load_config
 from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment.plan import Plan, make_plan
 from music_rllib.experiment.run_info import run_name
@@ -34,7 +34,7 @@ STAGES: list[dict[str, Any]] = [
 def config(folder: Path, tasks: list[str]) -> SweepConfig:
     file = folder / "sweep.yaml"
     file.write_text(yaml.safe_dump({"name": "s", "tasks": tasks, "seeds": 2, "stages": STAGES}))
-    return load_sweep(file)
+    return load_config(file)
 
 
 def plan(folder: Path, tasks: list[str]) -> Plan:
@@ -65,7 +65,7 @@ def test_the_view_has_a_line_for_each_condition_of_the_compared_stage(tmp_path: 
 
 
 def test_the_view_of_a_search_has_its_trials_of_which_none_is_planned_yet() -> None:
-    loaded = load_sweep(ROOT / "tune_configs" / "search.yaml")
+    loaded = load_config(ROOT / "tune_configs" / "search.yaml")
     stage = loaded.stage()
     state = json.loads(
         json.loads(comparison_view(make_plan(loaded), stage, "c0ffee", 1.5))["state"]

@@ -110,7 +110,7 @@ class Losses(NamedTuple):
     """[B] the critics' targets."""
 
 
-class Objective:
+class TACLoss:
     """TAC's losses (paper III-B) with the current networks, q and alpha.
 
     `module` has TAC's networks, with log alpha if it is learned; `now` the scheduled settings.
