@@ -41,6 +41,7 @@ OTHERS = {
     "mlflow",
     "pip",
     "prometheus",
+    "head",
 } | {
     "mkdir",
     "optuna-dashboard",
@@ -67,7 +68,7 @@ def snippets(language: str) -> list[Any]:
 
 def commands(text: str) -> Iterator[list[str]]:
     """The words of each simple command, without what is set before it and where it writes."""
-    text = re.sub(r"(^|\s)#\s.*$", "", text.replace("\\\n", " "), flags=re.MULTILINE)
+    text = re.sub(r"(^|\s)#(\s|!|SBATCH).*$", "", text.replace("\\\n", " "), flags=re.MULTILINE)
     lexer = shlex.shlex(text, posix=True, punctuation_chars=";|&\n")
     lexer.whitespace_split, lexer.whitespace, lexer.commenters = True, " \t", ""
     words: list[str] = []
@@ -108,7 +109,9 @@ def application(module: str) -> Any:
 def check(words: list[str]) -> None:
     """That a command is one, its options and files are there; those inside of it, too."""
     program = words[0].rpartition("/")[2]
-    if program == "music-rllib":
+    if program in ("exec", "srun"):
+        check(words[1:])
+    elif program == "music-rllib":
         parse(application("music_rllib.program"), program, words[1:])
     elif program == "python" and words[1:2] == ["-m"] and words[2] in MODULES:
         by_default = ["run"] * (words[2] == "music_rllib.sweep" and words[3].endswith(".yaml"))
