@@ -109,7 +109,7 @@ LAYER_KEYS = ("env_steps", "num_envs", *SECTIONS)
 
 YOUNGER: tuple[tuple[str, str], ...] = (
     ("tac", "log_std_form"), ("tac", "warmup_steps"), ("tac", "layer_norm"),
-    ("replay", "hindsight_goals"), ("replay", "n_steps"),
+    ("tac", "random_actions"), ("replay", "hindsight_goals"), ("replay", "n_steps"),
 )  # fmt: skip
 """Group and name of settings that are newer than the node keys of finished runs."""
 

@@ -98,7 +98,7 @@ class GaussianNoise(StrictModel):
     std: float = Field(0.2, ge=0)
     """Standard deviation in units of the action space scaled to [-1, 1]."""
     random_share: float = Field(0.3, ge=0, le=1)
-    """Share of actions that are uniformly random instead."""
+    """Share of actions that are random instead (`tac.random_actions`)."""
 
 
 class ColoredNoise(StrictModel):
@@ -114,7 +114,7 @@ class ColoredNoise(StrictModel):
     """Power of the noise over frequency f is f^-exponent: 0 is white noise, as with `policy`, 1
     pink noise, 2 Brownian noise. Higher values keep a direction for longer."""
     random_share: float = Field(0.0, ge=0, le=1)
-    """Share of actions that are uniformly random instead."""
+    """Share of actions that are random instead (`tac.random_actions`)."""
 
 
 def _alpha_kind(value: object) -> str:
@@ -225,8 +225,12 @@ class TACSettings(StrictModel):
     """Gradient updates per environment step. Larger values learn more from each step and take
     longer: updates are most of a run's time."""
     random_steps: int = Field(1_000, ge=0)
-    """First environment steps, with uniformly random actions. Larger values give the first updates
+    """First environment steps, with random actions. Larger values give the first updates
     more varied data, but later."""
+    random_actions: Literal["uniform", "wide"] = "uniform"
+    """Distribution of these and of other random actions: uniform, or tanh of a normal number with
+    standard deviation 3, which is mostly near a bound and moves farther (docs/lab/learner_screen.md
+    has the effect)."""
     warmup_steps: int | None = Field(None, ge=0)
     """Environment steps before the first update, which `replay_ratio` does not count. null:
     `random_steps`. 0: updates also follow random episodes, as in TAC-2020."""

@@ -57,6 +57,9 @@ DISPLACEMENT, MOVED = "object_displacement", "object_moved"
 MOVED_THRESHOLD = 0.01
 """Distance from its start (meters in the Fetch tasks) above which the object counts as moved."""
 
+WIDTH = 3.0
+"""Standard deviation, before tanh, of `random_actions: wide`."""
+
 Floats = NDArray[np.float32]
 
 
@@ -156,7 +159,7 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
             num_timesteps: play at least this many steps.
             num_episodes: play exactly this many episodes. Neither: one per sub-environment.
             explore: act by the training behavior; False: deterministically.
-            random_actions: act uniformly at random.
+            random_actions: act at random.
             force_reset: ignored, because every call begins with new episodes.
         """
         if explore is None:
@@ -250,7 +253,7 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
         """[B, I] -> [B, A] in [-1, 1]; `noise` [B, A] replaces independent normal noise."""
         shape = (len(inputs), self.layout.action)
         if random_actions:
-            return self._rng.uniform(-1.0, 1.0, shape).astype(np.float32)
+            return self._random(shape)
         behaviour = self._settings.behaviour
         if not explore:
             return actor(inputs, None)
@@ -262,9 +265,16 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
             actions = actor(inputs, noise)
         else:
             actions = np.clip(actor(inputs, None) + behaviour.std * noise, -1.0, 1.0)
-        uniform = self._rng.uniform(-1.0, 1.0, shape).astype(np.float32)
+        random = self._random(shape)
         is_random = self._rng.random((len(inputs), 1)) < behaviour.random_share
-        return np.where(is_random, uniform, actions)
+        return np.where(is_random, random, actions)
+
+    def _random(self, shape: tuple[int, int]) -> Floats:
+        """Random actions [B, A]."""
+        if self._settings.random_actions == "uniform":
+            return self._rng.uniform(-1.0, 1.0, shape).astype(np.float32)
+        wide: Floats = np.tanh(WIDTH * self._rng.standard_normal(shape, dtype=np.float32))
+        return wide
 
     # -- metrics and state ----------------------------------------------------------------
 

@@ -276,6 +276,14 @@ def test_noise_of_the_original_music() -> None:
     assert (np.abs(actions) <= 1).all()
 
 
+def test_wide_random_actions_are_mostly_near_a_bound() -> None:
+    made = runner(Countdown, num_envs=100, max_episode_steps=9, random_actions="wide")
+    actions = np.concatenate([each.actions for each in made.sample(random_actions=True)])
+    # P(|3 z| > artanh 0.9) = 0.62; uniform actions: 0.1.
+    assert 0.55 < (np.abs(actions) > 0.9).mean() < 0.7
+    assert abs((actions > 0).mean() - 0.5) < 0.1
+
+
 @pytest.mark.parametrize("exponent", [0.0, 1.0, 2.0])
 @pytest.mark.parametrize("steps", [49, 50])
 def test_colored_noise_is_standard_normal_with_the_given_spectrum(
