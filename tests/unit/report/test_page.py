@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import re
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from html import unescape
@@ -558,6 +559,29 @@ def test_stages_that_train_for_the_task_share_a_figure() -> None:
     assert f'id="{drawing.name}"' in page
     for one in (of_stages("pretrain", "plain"), of_stages("plain")):
         assert SIDE_BY_SIDE not in {drawing.stage for drawing in build_report(one).drawings}
+
+
+def test_success_by_chance_is_drawn_only_if_no_stage_trains_for_the_task() -> None:
+    def drawn(*stages: str) -> set[str]:
+        report = build_report(of_stages(*stages))
+        return {one.stage for one in report.drawings if one.metric is not None}
+
+    assert drawn("pretrain", "plain") == {"plain"}
+    assert drawn("pretrain") == {"pretrain"}
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_files_are_the_same_in_several_processes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    report = build_report(of_stages(*STAGES))
+    made = []
+    for threads in (1, 2):  # no process is forked beside other threads
+        monkeypatch.setattr(threading, "active_count", lambda threads=threads: threads)
+        page = write_report(report, tmp_path / str(threads))
+        files = sorted((page.parent / "figures").iterdir())
+        made.append([(path.name, path.read_bytes()) for path in files])
+    assert made[0] == made[1]
 
 
 def test_a_legend_stays_inside_its_figure() -> None:
