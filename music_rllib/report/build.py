@@ -7,6 +7,7 @@ import json
 import os
 import re
 import threading
+import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -242,7 +243,10 @@ def _drawn(figures: Sequence[Figure]) -> Iterator[Iterator[Mapping[str, bytes]]]
     with ProcessPoolExecutor(
         min(cores, len(figures)), get_context("fork"), _INHERITED.extend, (figures,)
     ) as pool:
-        yield pool.map(_draw_inherited, range(len(figures)))
+        with warnings.catch_warnings():  # of Python 3.12, about the idle threads of BLAS
+            warnings.simplefilter("ignore", DeprecationWarning)
+            drawn = pool.map(_draw_inherited, range(len(figures)))
+        yield drawn
 
 
 _INHERITED: list[Figure] = []

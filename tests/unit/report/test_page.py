@@ -570,7 +570,6 @@ def test_success_by_chance_is_drawn_only_if_no_stage_trains_for_the_task() -> No
     assert drawn("pretrain") == {"pretrain"}
 
 
-@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_files_are_the_same_in_several_processes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
