@@ -197,13 +197,9 @@ class TrajectoryReplay(TrajectoryRing):
 
     def _add_step(self, drawn: Transitions, ahead: int, rows: Rows, relabelled: Rows) -> None:
         """Extend the transitions `rows` by the step that is `ahead` of their first one."""
-        observation, width, frame = (
-            self.layout.observation,
-            self.layout.network_input,
-            self.layout.frame,
-        )
+        observation, width = self.layout.observation, self.layout.network_input
         after = self._steps.shape[1]
-        both = self._read(drawn.rows[rows] + ahead, 0, after + frame)
+        both = self._read(drawn.rows[rows] + ahead, 0, after + self.layout.frame)
         rewards = both[:, after - 2].copy()
         new = np.isin(rows, relabelled)
         if new.any():

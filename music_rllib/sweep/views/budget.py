@@ -15,7 +15,7 @@ _WITHOUT_COST: dict[str, bool | set[str]] = {
     "seed": True,
     "env_steps": True,
     "tac": {"entropic_index", "alpha", "gamma", "tau", "lr", "target_bounds"}
-    | {"random_steps", "warmup_steps"},
+    | {"random_steps", "random_actions", "warmup_steps"},
     "music": {"mi_reward_weight", "lr"},
 }
 """Settings that do not change how long a step takes."""
