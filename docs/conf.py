@@ -65,6 +65,7 @@ results/plan
 lab/claims
 lab/appendix
 lab/measurements
+lab/learner_screen
 changelog
 ```
 """
