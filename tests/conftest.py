@@ -44,8 +44,10 @@ os.environ.pop("PYTHONSAFEPATH", None)
 
 # No deadline: the machine is shared. Reproducible where a failure cannot be replayed from the
 # local example database.
-hypothesis.settings.register_profile("here", deadline=None)
-hypothesis.settings.register_profile("ci", deadline=None, derandomize=True, print_blob=True)
+hypothesis.settings.register_profile("here", deadline=None, max_examples=50)
+hypothesis.settings.register_profile(
+    "ci", deadline=None, max_examples=50, derandomize=True, print_blob=True
+)
 _IN_CI = os.environ.get("CI", "").lower() in ("1", "true")
 hypothesis.settings.load_profile("ci" if _IN_CI else "here")
 

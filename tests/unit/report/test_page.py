@@ -168,12 +168,13 @@ def test_runs_with_diverged_critics_are_listed() -> None:
 LOW, HIGH = [0.3, 0.32, 0.35, 0.31, 0.3], [0.9, 0.92, 0.88, 0.95, 0.9]
 
 
-@pytest.mark.parametrize("seeds", [2, 4, 5])
+@pytest.mark.parametrize("seeds", [4, 5])
 def test_final_values_have_no_test_and_verdicts_need_five_seeds(seeds: int) -> None:
     """Completely separate conditions: only the study has verdicts on the page."""
     report = build_report(compared({"1": LOW[:seeds], "1.5": HIGH[:seeds]}))
-    shown = Page(render(report)).text
-    (details,) = re.findall(r'<p class="soft details">([^<]*)', render(report))
+    page = render(report)
+    shown = Page(page).text
+    (details,) = re.findall(r'<p class="soft details">([^<]*)', page)
     assert details.startswith("Metric: mean success over 200,000 steps")
     assert ("superior" in shown) == (seeds == 5)
     assert (f"{seeds} seeds: no verdict below 5" in shown) == (seeds < 5)
@@ -495,15 +496,16 @@ def returning(finals: Mapping[str, Sequence[float]], task: str = "Reacher") -> S
 def test_the_primary_metric_of_a_task_without_success_is_the_return() -> None:
     sweep = returning({"1": [-9, -8, -7, -9.5, -8.5], "1.5": [-5, -4, -6, -4.5, -5.5]})
     report = build_report(sweep)
-    shown = Page(render(report))
+    page = render(report)
+    shown = Page(page)
     assert "No evaluation yet" not in shown.text
     assert "q = 1.5 against q = 1 on Reacher: superior" in shown.text
     drawn = {drawing.title: drawing for drawing in report.drawings}
     assert list(drawn) == ["Return", "Final return"]
-    assert "return of an episode" in render(report)
+    assert "return of an episode" in page
     assert {row["metric"] for row in curve_rows(report)} == {names.EVAL_RETURN}
     assert not report.analyses[0].times, "the task has no success rate"
-    assert row_of(render(report), "Reacher", "q = 1.5", "return") == [
+    assert row_of(page, "Reacher", "q = 1.5", "return") == [
         *("-5.00", "-5.98 to -4.02", "-6.00 -5.50 -5.00 -4.50 -4.00", "5", "5")
     ]
 
@@ -721,7 +723,7 @@ def test_subplots_with_many_lines_have_no_bands() -> None:
 
 
 def test_the_curve_comes_before_small_text_and_each_file_is_linked(tmp_path: Path) -> None:
-    report = build_report(compared({"1": LOW, "1.5": HIGH}))
+    report = build_report(compared({"1": [0.5], "1.5": [0.6]}))
     page = write_report(report, tmp_path).read_text()
     curve, details, groups = (
         page.index(f'id="{name}"') for name in ("curves", "details", "groups")

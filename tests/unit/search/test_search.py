@@ -79,13 +79,13 @@ def test_a_trial_is_stopped_only_if_its_interval_is_below_the_best() -> None:
 
 
 @pytest.mark.parametrize("how", ["iqm", "mean", "median", "worst_task"])
-@pytest.mark.parametrize(("tasks", "apart"), [(1, 0.0), (8, 0.0), (8, 20.0)])
+@pytest.mark.parametrize(("tasks", "apart"), [(1, 0.0), (8, 20.0)])
 def test_a_trial_as_good_as_its_only_rival_is_rarely_stopped(
     how: str, tasks: int, apart: float
 ) -> None:
     """At most one in eight with 90% intervals, however far apart the tasks are."""
     rng = np.random.default_rng(0)
-    draws = rng.normal(size=(1500, 2, 3, tasks)) + apart * np.arange(tasks)
+    draws = rng.normal(size=(600, 2, 3, tasks)) + apart * np.arange(tasks)
     objective, pruning = Objective(aggregate=how), Pruning(rungs=(Rung(seeds=3),))
     stopped = [
         reason_to_prune(objective, pruning, scores=mine, others={0: rival}, rung="here") is not None
