@@ -153,7 +153,7 @@ def test_tabular_tsallis_mdp_value_is_between_its_bounds(q: float) -> None:
         return pi.numpy()
 
     soft, best = np.zeros(states), np.zeros(states)
-    for _ in range(400):
+    for _ in range(200):
         q_soft = reward + gamma * transition @ soft
         pi = policy_of(q_soft)
         entropy = -(pi * ln_q(torch.as_tensor(np.maximum(pi, 1e-300)), q).numpy()).sum(-1)
