@@ -159,13 +159,18 @@ class ReplaySettings(StrictModel):
     importance_exponent: Annotated[Schedule, bounded("in [0, 1]", lambda b: 0 <= b <= 1)] = 0.4
     """PER: strength of the importance weights that correct its bias (beta; 1 corrects it fully)."""
 
-    def n_steps_problem(self, music: MusicSettings) -> str | None:
-        """The rule that `n_steps` breaks with these settings of the intrinsic reward."""
-        if self.n_steps == 1 or music.estimator == "none":
-            return None
-        return (
-            f"n_steps must be 1 with an intrinsic reward, which is of one step, got {self.n_steps}"
-        )
+    def problem(self, music: MusicSettings) -> str | None:
+        """The rule that these settings break with those of the intrinsic reward."""
+        if self.n_steps > 1 and music.estimator != "none":
+            got = self.n_steps
+            return f"n_steps must be 1 with an intrinsic reward, which is of one step, got {got}"
+        for name, kept in (("priority", "uniform"), ("hindsight_episodes", "all")):
+            if music.prioritise_replay and (got := getattr(self, name)) != kept:
+                return (
+                    f"{name} must be {kept} with music.prioritise_replay, got {got}: only one of "
+                    "them can decide what is replayed"
+                )
+        return None
 
     @model_validator(mode="after")
     def _one_choice(self) -> Self:
@@ -275,8 +280,8 @@ class RunSettings(StrictModel):
         return self
 
     @model_validator(mode="after")
-    def _intrinsic_reward_has_one_step(self) -> Self:
-        if problem := self.replay.n_steps_problem(self.music):
+    def _intrinsic_reward_fits_the_replay(self) -> Self:
+        if problem := self.replay.problem(self.music):
             raise ValueError(f"replay.{problem}")
         return self
 

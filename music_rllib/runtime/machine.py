@@ -117,10 +117,10 @@ def check_memory_and_gpus(resources: Resources) -> None:
     if cluster_address() is not None:
         return
     reserved, gpus = resources.memory_per_run, resources.gpus_per_run
-    if reserved is not None and reserved > (here := memory() / 2**30):
+    if reserved is not None and reserved > (here := free_memory() / 2**30):
         raise ClusterError(
             f"resources.memory_per_run must be <= {math.floor(here * 10) / 10:g}, the GiB of "
-            f"memory of this machine, got {reserved:g}"
+            f"memory of this machine that are free, got {reserved:g}"
         )
     if gpus and gpus > (count := _gpu_count()):
         raise ClusterError(
@@ -140,6 +140,15 @@ def memory() -> int:
         if text.isdecimal():  # or "max"
             limits.append(int(text))
     return min(limits)
+
+
+@cache
+def free_memory() -> int:
+    """Bytes of memory that other programs leave for runs; the first answer holds.
+
+    A local Ray offers as much, so that it can hold the runs that `check_memory_and_gpus` accepted.
+    """
+    return min(memory(), int(psutil.virtual_memory().available))
 
 
 def _gpu_count() -> int:

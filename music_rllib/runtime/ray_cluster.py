@@ -24,6 +24,7 @@ from music_rllib.runtime.machine import (
     ClusterError,
     check_cpus,
     cluster_address,
+    free_memory,
     ray_parent,
 )
 from music_rllib.runtime.quiet import quiet_third_parties
@@ -138,7 +139,11 @@ def cluster(resources: Resources) -> Iterator[Capacity]:
         ClusterError: There is no cluster at the address, a local one does not start, or no node can
             hold a run and no autoscaler adds nodes.
     """
-    start_ray(num_cpus=check_cpus(resources), object_store_memory=OBJECT_STORE_BYTES)
+    start_ray(
+        num_cpus=check_cpus(resources),
+        object_store_memory=OBJECT_STORE_BYTES,
+        _memory=free_memory(),
+    )
     try:
         yield _capacity(resources)
     finally:

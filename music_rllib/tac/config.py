@@ -232,22 +232,12 @@ class TACConfigBase(AlgorithmConfig):
                 f"num_learners must be 0 or 1, got {self.num_learners}: one update of TAC is too "
                 "small to be split. Run more trials instead."
             )
-        if music.prioritise_replay and replay.priority != "uniform":
-            self._value_error(
-                "replay_priority must be 'uniform' with music_prioritise_replay, "
-                f"got {replay.priority!r}: only one of them can decide what is replayed"
-            )
-        if music.prioritise_replay and replay.hindsight_episodes == "moved":
-            self._value_error(
-                "replay_hindsight_episodes must be 'all' with music_prioritise_replay, got "
-                "'moved': only one of them can decide what is replayed"
-            )
         if music.goals == "zero" and replay.hindsight_k > 0:
             self._value_error(
                 "replay_hindsight_k must be 0 with music_goals='zero' (hindsight would replace "
                 f"the zeros by achieved goals), got {replay.hindsight_k:g}"
             )
-        if problem := replay.n_steps_problem(music):
+        if problem := replay.problem(music):
             self._value_error(f"replay_{problem}")
         schedules = (
             tac.entropic_index,

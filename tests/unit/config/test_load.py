@@ -420,6 +420,10 @@ BAD: list[tuple[Document, str]] = [
         with_stage(1, variant="music-p", replay={"priority": "td_error"}),
         "replay.priority has no effect with variant music-p",
     ),
+    (
+        with_stage(1, music={"prioritise_replay": True}, replay={"priority": "td_error"}),
+        "replay.priority must be uniform with music.prioritise_replay, got td_error",
+    ),
     (with_stage(1, music={"hidden_size": 64}), "needs the same music.hidden_size in stage finetu"),
     (with_stage(1, name="pretrain"), "stages.pretrain.name must not repeat"),
     (with_stage(1, grid={"seed": [1]}), "grid.seed is not a known setting (did you mean 'seeds'?)"),
