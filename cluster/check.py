@@ -198,9 +198,16 @@ def _check_build(name: str, build: Any, compose: Path) -> Problems:
 QUANTITY = "io.k8s.apimachinery.pkg.api.resource.Quantity"
 
 
+def _cluster_schema() -> Any:
+    """The project's schema, with the fields of KubeRay 1.7 as its CRD has them."""
+    own, later = _schema("kuberay-1.6.json"), _strict(_schema("kuberay-1.7-crd.json"))
+    own["definitions"]["RayClusterSpec"]["properties"] |= later["properties"]
+    return own
+
+
 def kuberay_validator() -> Any:
     """For RayCluster and RayJob, pods included."""
-    own, core = _schema("kuberay-1.6.json"), _schema("kubernetes-1.34.json")
+    own, core = _cluster_schema(), _schema("kubernetes-1.34.json")
     # Kubernetes itself takes any number and text for a start.
     core["definitions"][QUANTITY] = own["definitions"]["Quantity"]
     resource = DRAFT7.create_resource(core)
@@ -214,9 +221,7 @@ def check_kuberay(document: dict[str, Any], _: Path, crds: Crds | None = None) -
     if kind not in tuple(CRD_FILES):
         yield f"kind: must be {' or '.join(CRD_FILES)}, got {kind!r}"
         return
-    own = kuberay_validator().evolve(
-        schema=_schema("kuberay-1.6.json") | {"$ref": f"#/definitions/{kind}"}
-    )
+    own = kuberay_validator().evolve(schema=_cluster_schema() | {"$ref": f"#/definitions/{kind}"})
     problems = list(_violations(document, own))
     yield from problems
     yield from check_placeholders(document)
@@ -250,6 +255,9 @@ def _check_groups(document: dict[str, Any]) -> Problems:
         version = tuple(map(int, re.findall(r"\d+", spec["rayVersion"])[:2]))
         if version < (2, 52):
             yield f"{place}.rayVersion: must be >= 2.52.0 for mode: token, got {spec['rayVersion']}"
+    state = spec.get("gcsFaultToleranceOptions", {"backend": "rocksdb"})
+    if state.get("backend") != "rocksdb" and "redisAddress" not in state:
+        yield f"{place}.gcsFaultToleranceOptions.redisAddress: must be given without rocksdb"
     scaled = spec.get("enableInTreeAutoscaling", False)
     for index, group in enumerate(spec.get("workerGroupSpecs", ())):
         where = f"{place}.workerGroupSpecs.{index}"
@@ -451,7 +459,7 @@ def check_datasource(document: dict[str, Any], _: Path) -> Problems:
                 yield f"datasources.{index}.{key}: must be a text, got {source.get(key)!r}"
 
 
-def check_kustomization(document: dict[str, Any], path: Path) -> Problems:
+def check_kustomization(document: dict[str, Any], path: Path, crds: Crds | None = None) -> Problems:
     """The files that it puts together; `kubectl kustomize FOLDER` knows the rest."""
     if not isinstance(document["resources"], list):
         yield "resources: must be a list"
@@ -462,6 +470,28 @@ def check_kustomization(document: dict[str, Any], path: Path) -> Problems:
         if not there and "://" not in str(resource):
             place = f"resources.{index}"
             yield f"{place}: {resource} must be a file or a folder with kustomization.yaml"
+    files = [file for one in document["resources"] for file in (path.parent / one).glob("*.yaml")]
+    objects = [yaml.safe_load(file.read_text(encoding="utf-8")) for file in files]
+    for index, entry in enumerate(document.get("patches", ())):
+        patch = yaml.safe_load(entry["patch"])
+        patched = [one for one in objects if _is_same(one, patch)]
+        if not patched:
+            yield f"patches.{index}: must be of an object of the resources"
+        for one in patched:
+            for problem in check_kuberay(_merged(one, patch), path, crds):
+                yield f"patches.{index}: {problem}"
+
+
+def _is_same(one: dict[str, Any], other: dict[str, Any]) -> bool:
+    named = one.get("metadata", {}).get("name") == other["metadata"]["name"]
+    return bool(named and one.get("kind") == other["kind"])
+
+
+def _merged(document: Any, patch: Any) -> Any:
+    """As kustomize merges a patch into a custom resource."""
+    if not isinstance(document, dict) or not isinstance(patch, dict):
+        return patch
+    return document | {key: _merged(document.get(key), value) for key, value in patch.items()}
 
 
 def _mappings(entries: Any) -> list[dict[str, Any] | None]:
@@ -490,12 +520,13 @@ def check_document(document: Any, path: Path, crds: Crds | None = None) -> list[
         return list(check_kuberay(document, path, crds))
     for key, check in KINDS.items():
         if key in document:
-            return list(check(document, path))
+            more = (crds,) if check is check_kustomization else ()
+            return list(check(document, path, *more))
     found = ", ".join(map(str, document)) or "none"
     return [f"must be of a kind that has one of the keys {', '.join(KINDS)}, got {found}"]
 
 
-KINDS: dict[str, Callable[[dict[str, Any], Path], Problems]] = {
+KINDS: dict[str, Callable[..., Problems]] = {
     "provider": check_launcher,
     "services": check_compose,
     "applications": check_serve,
@@ -512,6 +543,7 @@ ALL = (
     "grafana-datasource.yml",
     "kuberay/raycluster/kustomization.yaml",
     "kuberay/raycluster/raycluster.yaml",
+    "kuberay/raycluster-1.7/kustomization.yaml",
     "kuberay/rayjob/kustomization.yaml",
     "kuberay/rayjob/rayjob.yaml",
     "kuberay/storage/kustomization.yaml",

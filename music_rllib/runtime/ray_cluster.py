@@ -37,6 +37,8 @@ LISTED_MACHINES = "local.cluster.node"
 """The launcher's node group for listed machines, to which it cannot add others."""
 WAITING = 200
 """Maximum number of waiting runs if an autoscaler adds nodes for them; Tune's own default."""
+RESTART_MINUTES = 5.0
+"""Time that the nodes of a cluster need to join its head again after a restart."""
 LOOK_SECONDS = 5.0
 """Time between two checks of a cluster, and timeout of each."""
 DAEMONS = ("gcs_server", "raylet")
@@ -48,10 +50,16 @@ class Capacity:
 
     now: int
     """Number of runs that the present nodes can hold at once; 0 only if the cluster grows."""
+    nodes: int = 1
     grows: bool = False
     """Whether an autoscaler may add nodes."""
     memory: int = 0
     """Memory of the largest node, in bytes."""
+
+    @property
+    def node_memory(self) -> float:
+        """Memory of the largest node that there may be, in bytes."""
+        return math.inf if self.grows else self.memory
 
     @property
     def at_once(self) -> int:
@@ -132,8 +140,18 @@ def _worker_setup() -> Callable[[], None]:
 
 
 @contextlib.contextmanager
-def cluster(resources: Resources) -> Iterator[Capacity]:
+def cluster(
+    resources: Resources,
+    wait_minutes: float | None = None,
+    say: Callable[[str], None] = lambda _: None,
+) -> Iterator[Capacity]:
     """Connect to Ray for this `with`, and yield its capacity.
+
+    Args:
+        resources: The resources of a run.
+        wait_minutes: Time to wait for a node that can hold a run. None: `RESTART_MINUTES`, if no
+            node of the cluster has a CPU.
+        say: Receives a message before the wait.
 
     Raises:
         ClusterError: There is no cluster at the address, a local one does not start, or no node can
@@ -145,9 +163,28 @@ def cluster(resources: Resources) -> Iterator[Capacity]:
         _memory=free_memory(),
     )
     try:
-        yield _capacity(resources)
+        yield _wait_for_nodes(resources, wait_minutes, say)
     finally:
         stop_ray()
+
+
+def _wait_for_nodes(
+    resources: Resources, wait_minutes: float | None, say: Callable[[str], None]
+) -> Capacity:
+    waited = 0.0
+    while True:
+        try:
+            return _capacity(resources)
+        except ClusterError as error:
+            only_head = not any(n["Resources"].get("CPU") for n in ray.nodes() if n["Alive"])
+            minutes = RESTART_MINUTES * only_head if wait_minutes is None else wait_minutes
+            if cluster_address() is None or waited >= 60 * minutes:
+                hint = "; no node with CPUs has joined its head yet" if only_head else ""
+                raise ClusterError(f"{error}{hint}") from None
+            if not waited:
+                say(f"{error}; waiting up to {minutes:g} minutes for nodes (--wait-for-nodes)")
+        time.sleep(LOOK_SECONDS)
+        waited += LOOK_SECONDS
 
 
 # -- capacity ---------------------------------------------------------------------------------
@@ -165,7 +202,7 @@ def _capacity(resources: Resources) -> Capacity:
         if not may_grow:
             raise
         now = 0
-    return Capacity(now=now, grows=may_grow, memory=memory)
+    return Capacity(now=now, nodes=len(nodes), grows=may_grow, memory=memory)
 
 
 def grows() -> bool:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
@@ -35,6 +35,7 @@ from music_rllib.redaction import redact
 from music_rllib.runtime.machine import (
     check_cpus,
     check_memory_and_gpus,
+    check_reachable,
     cluster_address,
     ray_parent,
 )
@@ -42,7 +43,10 @@ from music_rllib.runtime.process import early
 from music_rllib.store.storage import check_storage, is_remote, resolve_storage
 from music_rllib.sweep import preflight
 from music_rllib.sweep.preflight import check_demand
-from music_rllib.sweep.views.plan import plan_answer, plan_view
+from music_rllib.sweep.views.plan import cluster_answer, plan_answer, plan_view
+
+if TYPE_CHECKING:
+    from music_rllib.runtime.ray_cluster import Capacity
 
 DEFAULT_CONFIG = Path(__file__).with_name("default.yaml")
 VARIABLE = "MLFLOW_TRACKING_URI"
@@ -90,13 +94,14 @@ def plan(config: SweepConfig, *, measure: bool = False, as_json: bool = False) -
     """
     console = console_for(as_json=as_json)
     try:
-        opened = _open(console, config)
+        opened, cluster = _open(console, config, wait_minutes=0.0)
         preflight.check_searches(opened)
         texts = filter(None, (changes_since(opened), changed_text(opened, found_runs(opened))))
         changes = "\n".join(map(str, texts))
         if changes:
             _say(console, changes, "yellow")
         document = plan_answer(opened, changes)
+        document["cluster"] = None if cluster is None else cluster_answer(opened, cluster)
         document["analysis_plan"] = _record_analysis_plan(console, opened)
         if measure:
             document["cost"] = _measure(console, opened)
@@ -115,6 +120,7 @@ def run(
     retrain: Sequence[str] = (),
     keep_runs: bool = False,
     retrain_damaged: bool = False,
+    wait_minutes: float | None = None,
     as_json: bool = False,
 ) -> int:
     """Train the runs of a sweep, compare them, and log them to MLflow.
@@ -126,6 +132,7 @@ def run(
         retrain: Tasks or labels of runs whose results are deleted and which are trained again.
         keep_runs: Use runs whose environment has changed.
         retrain_damaged: Delete damaged finished runs and train them again.
+        wait_minutes: Time to wait for nodes of a cluster; by default only if it has no CPUs.
         as_json: Print the sweep's last `state.json` on standard output.
 
     Returns:
@@ -141,7 +148,7 @@ def run(
     console = console_for(as_json=as_json)
     warn = partial(_say, console, style="yellow")
     try:
-        opened = _open(console, config, lenient=retrain_damaged)
+        opened, _ = _open(console, config, lenient=retrain_damaged, wait_minutes=wait_minutes)
         changes = changes_since(opened)
         if changes is not None and not accept_changes:
             raise BadInputError(str(changes))
@@ -151,7 +158,7 @@ def run(
         with hold_driver_lock(opened, partial(_say, console)), early:
             remove_damaged(opened, warn)
             opened = accept_environments(remove_runs(opened, again, warn), kept, warn)
-            _check(console, opened)
+            _check(opened)
             with open_tracker(opened) as tracker:
                 for retrained in again:
                     tracker.forget(retrained.key)
@@ -165,13 +172,23 @@ def run(
     return code
 
 
-def _open(console: Console, config: SweepConfig, *, lenient: bool = False) -> OpenSweep:
+def _open(
+    console: Console,
+    config: SweepConfig,
+    *,
+    lenient: bool = False,
+    wait_minutes: float | None,
+) -> tuple[OpenSweep, Capacity | None]:
     """Check what can be checked without starting anything, and show the plan.
 
     Args:
         console: Shows the plan.
         config: The sweep's configuration.
         lenient: Whether finished runs may be damaged.
+        wait_minutes: Time to wait for nodes of a cluster.
+
+    Returns:
+        The sweep, and the room of the cluster that is to train it.
     """
     config = _with_environment(console, config)
     if config.path == DEFAULT_CONFIG:
@@ -192,17 +209,19 @@ def _open(console: Console, config: SweepConfig, *, lenient: bool = False) -> Op
         resolve_store(config.mlflow.tracking_uri, storage)
     console.print(plan_view(config, planned, opened.finished))
     _say(console, f"Storage: {redact(storage)}")
+    cluster = preflight.find_cluster(console, opened, wait_minutes)
+    memory = None if cluster is None else cluster.node_memory
     notes = (
         remark,
         *played,
         *warnings_of(config),
         *shared_runs(planned),
-        *check_demand(opened),
+        *check_demand(opened, memory),
         *continued_runs_text(opened),
     )
     for line in filter(None, notes):
         _say(console, line, "yellow")
-    return opened
+    return opened, cluster
 
 
 def _with_environment(console: Console, config: SweepConfig) -> SweepConfig:
@@ -216,12 +235,13 @@ def _with_environment(console: Console, config: SweepConfig) -> SweepConfig:
     return replace(config, mlflow=mlflow, document={**config.document, "mlflow": vars(mlflow)})
 
 
-def _check(console: Console, opened: OpenSweep) -> None:
+def _check(opened: OpenSweep) -> None:
     """Run every check that can reject the sweep, before recording that it started."""
     preflight.import_checkpoints(opened.plan, opened.store)
     preflight.verify_inputs(opened.scheduler, opened.store)
     preflight.check_searches(opened)
-    preflight.check_ray(console, opened)
+    if (address := cluster_address()) is not None and not opened.scheduler.complete:
+        check_reachable(address)
 
 
 def _record_analysis_plan(console: Console, opened: OpenSweep) -> list[dict[str, Any]]:

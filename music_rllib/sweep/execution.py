@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from socket import gethostname
 from typing import Any
 
 from rich.console import Console
@@ -93,7 +95,11 @@ def compute_and_report(
             or (stopped_by is None and not opened.scheduler.complete)
         )
         state_file.end("stopped" if stopped_by else "failed" if failed else "finished")
-    tracker.close("KILLED" if stopped_by else "FAILED" if failed else "FINISHED")
+
+    def say_left(records: int) -> None:
+        console.print(f"Sending to MLflow: {records:,} records left (Ctrl-C to send them later)")
+
+    tracker.close("KILLED" if stopped_by else "FAILED" if failed else "FINISHED", say=say_left)
     _show_results(console, opened, tracker, state_file, searches)
     if lost:
         console.print(
@@ -265,8 +271,27 @@ def report_at_end(storage: str, name: str, tracking_uri: str | None, config: Pat
         marks = ("Report: ", "Picture: ")
         made = [line for line in done.stdout.splitlines() if line.startswith(marks)]
         errors = done.stderr.strip().splitlines()
+        if "RAY_JOB_CONFIG_JSON_ENV_VAR" in environment or is_remote(storage):
+            made = elsewhere(done.stdout, below(redact(storage), name))
         if made:  # even if it could not be attached, or if runs are damaged
             return "\n".join(made if done.returncode == 0 else [*made, *errors[-1:]])
         reason = errors[-1] if errors else f"it ended with exit code {done.returncode}"
     place = below(redact(storage), name)
     return f"No report: {reason}. Make it with: music-rllib report {place}"
+
+
+def elsewhere(output: str, sweep: str) -> list[str]:
+    """Lines about a report that the user may read on another machine than this one.
+
+    Args:
+        output: The output of the report's process.
+        sweep: The sweep's folder or URI.
+    """
+    lines = [line for line in output.splitlines() if re.match("Attached .*: https?:", line)]
+    for line in output.splitlines():
+        if line.startswith("Report: "):
+            lines += [
+                f"On your machine: music-rllib report {sweep}",
+                f"{line} (on {gethostname()})",
+            ]
+    return lines

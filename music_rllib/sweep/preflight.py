@@ -10,14 +10,20 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterable, Iterator
+from functools import partial
+from itertools import pairwise
+from operator import attrgetter
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from rich.console import Console
 
+from music_rllib.config.problems import shown
+from music_rllib.config.run_settings import RunSettings
 from music_rllib.envs.fingerprint import Fingerprint, fingerprint_of
-from music_rllib.envs.tasks import BUILT_IN_TASKS, folders_for_workers
+from music_rllib.envs.tasks import BUILT_IN_TASKS, Task, folders_for_workers
 from music_rllib.errors import BadInputError
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.open_sweep import OpenSweep
@@ -28,17 +34,11 @@ from music_rllib.runtime.machine import memory as memory_of_machine
 from music_rllib.runtime.process import early
 from music_rllib.store.handoff import open_handoff, read_handoff
 from music_rllib.store.node_store import NodeStore
+from music_rllib.sweep.views.plan import cluster_answer, cluster_text
 
 if TYPE_CHECKING:
     from music_rllib.envs.probe import Question
-from collections.abc import Iterable, Iterator
-from itertools import pairwise
-from operator import attrgetter
-from typing import TYPE_CHECKING
-
-from music_rllib.config.problems import shown
-from music_rllib.config.run_settings import RunSettings
-from music_rllib.envs.tasks import Task
+    from music_rllib.runtime.ray_cluster import Capacity
 
 _TIMEOUT = "Timeout ("
 """Beginning of the stack that `faulthandler` writes if a call takes too long."""
@@ -219,26 +219,34 @@ def check_searches(opened: OpenSweep) -> None:
         check_studies(opened)
 
 
-def check_ray(console: Console, opened: OpenSweep) -> None:
-    """Check that a cluster answers and can hold a run, unless everything is computed.
+def find_cluster(
+    console: Console, opened: OpenSweep, wait_minutes: float | None
+) -> Capacity | None:
+    """Connect to the cluster, and show its room for runs, unless everything is computed.
+
+    Args:
+        console: Shows the cluster, and that the sweep waits for nodes.
+        opened: The sweep.
+        wait_minutes: Time to wait for nodes, as in `cluster`.
 
     Raises:
-        ClusterError: It does not.
+        ClusterError: It does not answer, or cannot hold a run.
     """
     begun = (opened.folder / sweep_files.CONFIG).is_file()
-    address, resources = cluster_address(), opened.config.resources
+    address = cluster_address()
     if address is None or (opened.scheduler.complete and (begun or not opened.plan.searched)):
-        return
+        return None
     check_reachable(address)
-    if resources.bundle == {"CPU": 1}:  # every node can hold that
-        return
     from music_rllib.runtime.ray_cluster import cluster
 
-    with cluster(resources) as capacity:
+    say = partial(console.print, style="yellow", soft_wrap=True)
+    with cluster(opened.config.resources, wait_minutes, say) as capacity:
+        console.print(cluster_text(address, cluster_answer(opened, capacity)), soft_wrap=True)
         if capacity.remark is not None:
-            console.print(capacity.remark, style="yellow", soft_wrap=True)
+            say(capacity.remark)
     early.install()  # Ray has set a handler of its own
     early.check()
+    return capacity
 
 
 # Memory and time ----------------------------------------------------------------------------------
@@ -256,46 +264,34 @@ LONG_DAYS = 60
 """A run that takes longer at these rates is probably a mistake."""
 ENVIRONMENT_BYTES = 10_000
 """Memory of one sub-environment; MuJoCo's take a hundred times as much."""
-CERTAIN_BYTES = 2 * 2**30
-"""Memory that every node of a cluster is assumed to have."""
 
 
 class DemandError(BadInputError, ValueError):
     """A run does not fit on any available machine."""
 
 
-def check_demand(sweep: OpenSweep) -> list[str]:
+def check_demand(sweep: OpenSweep, node_memory: float | None = None) -> list[str]:
     """Check that the unfinished runs fit into memory.
+
+    Args:
+        sweep: The sweep.
+        node_memory: Bytes of the largest node of a cluster; None: this machine's memory counts.
 
     Returns:
         Warnings about runs that would take months or years.
 
     Raises:
         DemandError: A run does not fit.
-        ClusterError: The cluster can't be reached.
     """
     runs = [(node.stage, node.run) for node in sweep.plan.nodes if node.key not in sweep.finished]
     for stage in sweep.config.stages:
         if stage.search is not None:
             runs += [(stage.name, run) for run in stage.points[0].runs.values()]
-    place, memory = "this machine", float(memory_of_machine())
-    if (address := cluster_address()) is not None:
-        place, memory = "the cluster's largest node", _cluster_memory(address, sweep, runs)
-    check_memory(runs, place, memory)
+    if node_memory is None:
+        check_memory(runs, "this machine", memory_of_machine())
+    else:
+        check_memory(runs, "the cluster's largest node", node_memory)
     return list(long_runs(runs))
-
-
-def _cluster_memory(
-    address: str, sweep: OpenSweep, runs: Iterable[tuple[str, RunSettings]]
-) -> float:
-    """Memory of the cluster's largest node, which is only looked up if the runs need much."""
-    if max((least_memory(run) for _, run in runs), default=0) <= CERTAIN_BYTES:
-        return CERTAIN_BYTES
-    from music_rllib.runtime.ray_cluster import cluster
-
-    check_reachable(address)
-    with cluster(sweep.config.resources) as capacity:
-        return float("inf") if capacity.grows else capacity.memory
 
 
 def check_memory(runs: Iterable[tuple[str, RunSettings]], place: str, memory: float) -> None:

@@ -9,7 +9,7 @@ import re
 import shutil
 import sqlite3
 import warnings
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -22,6 +22,7 @@ from mlflow.entities import (
     LoggedModel,
     LoggedModelOutput,
     LoggedModelStatus,
+    Metric,
     Param,
     RunTag,
 )
@@ -35,6 +36,8 @@ from music_rllib.redaction import redact
 from music_rllib.tracking.policy_model import MODEL_NAME, write_model
 from music_rllib.tracking.store import TrackingStore
 
+MAX_METRICS, MAX_PARAMS = 1000, 100
+"""MLflow's limits for one request: metrics, or metrics, params and tags together; and params."""
 REQUEST_SECONDS = 30
 """Timeout of one request, unless MLFLOW_HTTP_REQUEST_TIMEOUT sets another."""
 SCHEMA_SECONDS = 120.0
@@ -169,10 +172,14 @@ class Experiment:
             names.TAG_CURRENT: names.CURRENT,
             own[0]: own[1],
         }
-        known, self._known = self._known or {}, None  # listed again if the response gets lost
-        run = self.client.create_run(self.id, start_time=time, tags=all_tags, run_name=name)
+        try:
+            run = self.client.create_run(self.id, start_time=time, tags=all_tags, run_name=name)
+        except Exception:
+            self._known = None  # listed again, as the response may be lost
+            raise
         new = KnownRun(str(run.info.run_id), run.info.status, all_tags)
-        self._known = known | {node_key: new}
+        if self._known is not None:
+            self._known[node_key] = new
         return new
 
     def _list(self) -> dict[str, KnownRun]:
@@ -246,22 +253,42 @@ class Experiment:
         }
 
     def begin_run(self, run_id: str, tags: Mapping[str, str], params: Mapping[str, str]) -> None:
-        """Mark the run as running, with these tags and params, without the tags of an earlier end.
+        """Mark an earlier run as running, with these tags and params, without tags of its end.
 
         MLflow's params are immutable: a param that the run already has keeps its value.
         """
         run = self.client.get_run(run_id)
-        fresh = [Param(*item) for item in params.items() if item[0] not in run.data.params]
-        self.set_tags(run_id, tags)
-        self.client.log_batch(run_id, params=fresh)
+        fresh = {name: value for name, value in params.items() if name not in run.data.params}
+        self.log(run_id, tags=tags, params=fresh)
         for tag in {names.TAG_FAILURE, names.TAG_PRUNED} & run.data.tags.keys() - tags.keys():
             self.client.delete_tag(run_id, tag)
         if run.info.status != "RUNNING":
             self.client.update_run(run_id, status="RUNNING")
 
+    def log(
+        self,
+        run_id: str,
+        *,
+        metrics: Sequence[Metric] = (),
+        params: Mapping[str, str] = {},
+        tags: Mapping[str, str] = {},
+    ) -> None:
+        """Log all of it in as few requests as MLflow's limits allow, usually one."""
+        if not (metrics or params or tags):
+            return
+        left = [Param(*item) for item in params.items()]
+        while len(left) > MAX_PARAMS:
+            self.client.log_batch(run_id, params=left[:MAX_PARAMS])
+            left = left[MAX_PARAMS:]
+        given = [RunTag(*item) for item in tags.items()]
+        if len(metrics) + len(left) + len(given) > MAX_METRICS:
+            self.client.log_batch(run_id, params=left, tags=given)
+            left, given = [], []
+        self.client.log_batch(run_id, metrics=metrics, params=left, tags=given)
+
     def set_tags(self, run_id: str, tags: Mapping[str, str]) -> None:
         """Set tags; existing tags of the same names are overwritten."""
-        self.client.log_batch(run_id, tags=[RunTag(*item) for item in tags.items()])
+        self.log(run_id, tags=tags)
 
     def log_policy(self, run_id: str, content: bytes) -> None:
         """Upload a policy as the run's logged model, unless it was uploaded before."""

@@ -22,10 +22,8 @@ from music_rllib.experiment.run_info import RunInfo
 from music_rllib.redaction import flat_params, redact
 from music_rllib.runtime.machine import provenance_tags
 from music_rllib.store.history import Report
-from music_rllib.tracking.client import Experiment, KnownRun, Status
+from music_rllib.tracking.client import MAX_METRICS, Experiment, KnownRun, Status
 
-MAX_METRICS = 1000
-"""MLflow's limit for the metrics of one request."""
 Record = Report | Callable[[], None]
 """A report, or a function that sends something else."""
 
@@ -34,7 +32,8 @@ class StoredRun(NamedTuple):
     """The data of a finished run in the store."""
 
     reports: Sequence[Report]
-    policy: bytes | None = None
+    read_policy: Callable[[], bytes | None] | None = None
+    """Reads the policy; called after the histories of all runs were sent."""
 
 
 class _Cancelled(Exception):  # noqa: N818 - no error
@@ -66,6 +65,10 @@ class RunQueue:
         """Last step that MLflow has of each metric."""
         self._ended = True
         self._cancelled = False
+        self._is_new = False
+        """Whether this process created the run, which has no params yet."""
+        self._policy: Record = self._send_policy
+        self._read_policy: Callable[[], bytes | None] | None = None
 
     # -- adding to the queue -----------------------------------------------------------------
 
@@ -90,7 +93,7 @@ class RunQueue:
         """The run is in the store: the result of `read` replaces all records in the queue."""
         with self._lock:
             self._info, self._ended = info, True
-            self._records = deque([partial(self._send_stored, read)])
+            self._records = deque([partial(self._send_stored, read), self._policy])
 
     def keep_current(self, node_keys: Iterable[str]) -> None:
         """The sweep, whose parent run this is, has the runs of these nodes and no others."""
@@ -118,6 +121,11 @@ class RunQueue:
         return self._run.run_id if self._run else self._experiment.known_id(self.node_key)
 
     @property
+    def source(self) -> str | None:
+        """Key of the node that the run starts from."""
+        return self._info.source_node
+
+    @property
     def records(self) -> int:
         """Number of records in the queue."""
         return len(self._records)
@@ -128,27 +136,35 @@ class RunQueue:
 
     # -- sending -----------------------------------------------------------------------------
 
-    def send(self) -> None:
-        """Send the records in order. Raises MLflow's error at the first one that fails."""
+    def send(self, *, policy: bool = True) -> None:
+        """Send the records in order, up to the policy or with it.
+
+        Raises MLflow's error at the first record that fails.
+        """
         with contextlib.suppress(_Cancelled):
             while not self._cancelled and (records := self._next()):
-                if callable(first := records[0]):
+                if (first := records[0]) is self._policy and not policy:
+                    return
+                if callable(first):
                     first()
                 else:
                     self._log([record for record in records if isinstance(record, Report)])
                 self._remove(records)
 
-    def attach(self, started: int | None = None) -> KnownRun:
+    def attach(self, started: int | None = None, tags: Mapping[str, str] = {}) -> KnownRun:
         """The run in MLflow, which is found there or created.
 
         Args:
             started: Start time of a run that is created, in ms since the epoch; by default now.
+            tags: Further tags of a run that is created.
         """
         if self._run is None:
             run = self._experiment.find(self.node_key, self._environment)
             if run is None:
                 name, time = self._info.name, started or _now()
-                run = self._experiment.create(self.node_key, name, time, self._tags())
+                all_tags = {**self._tags(), **tags}
+                run = self._experiment.create(self.node_key, name, time, all_tags)
+                self._is_new = True
             else:
                 self._last_steps = self._experiment.last_steps(run.run_id)
             self._run = run
@@ -168,8 +184,16 @@ class RunQueue:
                     self._records.popleft()
 
     def _send_start(self) -> None:
-        run_id = self.attach().run_id
-        self._experiment.begin_run(run_id, self._tags(), flat_params(self._info.config))
+        self._experiment.log(self.attach().run_id, params=self._begin())
+        self._is_new = False
+
+    def _begin(self, started: int | None = None, tags: Mapping[str, str] = {}) -> dict[str, str]:
+        """Create the run, or resume it; the params that it still lacks."""
+        run_id, params = self.attach(started, tags).run_id, flat_params(self._info.config)
+        if self._is_new:
+            return params
+        self._experiment.begin_run(run_id, {**self._tags(), **tags}, params)
+        return {}
 
     def _send_end(self, status: Status, time: int, tags: Mapping[str, str]) -> None:
         run_id = self.attach().run_id
@@ -180,22 +204,28 @@ class RunQueue:
     def _send_stored(self, read: Callable[[], StoredRun]) -> None:
         known = self._experiment.find(self.node_key, self._environment)
         if self._run is None and known is not None and known.is_complete:
-            self._run = known
+            self._run, self._read_policy = known, None
             return
         stored = read()
+        self._read_policy = stored.read_policy
         times = [report.timestamp_ms for report in stored.reports] or [_now()]
-        run_id = self.attach(times[0]).run_id
-        tags = {**self._tags(), names.TAG_INCOMPLETE: "its policy is not uploaded yet"}
-        self._experiment.begin_run(run_id, tags, flat_params(self._info.config))
-        self._log(stored.reports)
-        self._experiment.client.set_terminated(run_id, "FINISHED", times[-1])
-        self._check_cancelled()
-        if stored.policy is not None:
-            self._experiment.log_policy(run_id, stored.policy)
+        unfinished = {names.TAG_INCOMPLETE: "its policy is not uploaded yet"}
+        params = self._begin(times[0], {} if stored.read_policy is None else unfinished)
+        self._log(stored.reports, params)
+        self._is_new = False
+        self._experiment.client.set_terminated(self.attach().run_id, "FINISHED", times[-1])
+
+    def _send_policy(self) -> None:
+        if self._read_policy is None:
+            return
+        run_id = self.attach().run_id
+        if (policy := self._read_policy()) is not None:
+            self._check_cancelled()
+            self._experiment.log_policy(run_id, policy)
         self._experiment.client.delete_tag(run_id, names.TAG_INCOMPLETE)
 
-    def _log(self, reports: Sequence[Report]) -> None:
-        """Log the settings and the values that MLflow lacks, as a resumed run repeats steps."""
+    def _log(self, reports: Sequence[Report], params: Mapping[str, str] = {}) -> None:
+        """Log params, settings and the values that MLflow lacks, as a resumed run repeats steps."""
         run_id = self.attach().run_id
         metrics = [
             Metric(name, value, report.timestamp_ms, report.env_steps)
@@ -214,10 +244,10 @@ class RunQueue:
             if metric.step > last.get(metric.key, -1):
                 last[metric.key] = metric.step
                 new.append(metric)
-        for begin in range(0, len(new), MAX_METRICS):
+        for begin in range(0, len(new) or 1, MAX_METRICS):
             self._check_cancelled()
             chunk = new[begin : begin + MAX_METRICS]
-            self._experiment.client.log_batch(run_id, metrics=chunk)
+            self._experiment.log(run_id, metrics=chunk, params=params if begin == 0 else {})
             self._last_steps.update((metric.key, metric.step) for metric in chunk)
 
     def _check_cancelled(self) -> None:

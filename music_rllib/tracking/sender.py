@@ -5,7 +5,10 @@ from __future__ import annotations
 import logging
 import random
 import threading
+from collections import deque
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from threading import Thread
 
 from music_rllib.store.storage import DamagedError
 from music_rllib.tracking.client import is_lasting, mlflow_reason
@@ -13,6 +16,8 @@ from music_rllib.tracking.run_queue import RunQueue
 
 logger = logging.getLogger(__name__)
 
+SAY_SECONDS = 5.0
+"""Time between two messages about the records that are left."""
 GATHER_SECONDS = 0.2
 """Wait before each round, so that one request takes several reports."""
 FIRST_PAUSE = 0.5
@@ -31,22 +36,23 @@ class Pending:
         return self.records > 0
 
 
-class Sender(threading.Thread):
+class Sender(Thread):
     """Sends the records of each run in order, and retries with growing pauses after a failure.
 
     A failure that may pass (server down or busy, disk full) ends the round, and its run moves to
     the end of the list, so that one bad run does not block the others. After a lasting failure
     (a refused value, a deleted run, a damaged node) the run is not sent until the sweep is started
     again. A run that has ended and is delivered is dropped, so the cost of a round depends only on
-    the active runs. `store` is the public URI of MLflow's store, for messages.
+    the active runs. A run is sent after the run that it starts from, whose id it has as a tag.
     """
 
-    def __init__(self, store: str) -> None:
+    def __init__(self, store: str, at_once: int = 1) -> None:
+        """Send to `store`, its public URI for messages, with `at_once` requests at a time."""
         super().__init__(name="mlflow-sender", daemon=True)
-        self._store = store
+        self._store, self._at_once = store, at_once
         self._runs: dict[RunQueue, None] = {}
         self._change = threading.Condition()
-        self._has_news = self._flushing = self._stopped = False
+        self._has_news = self._flushing = self._stopped = self._failed = False
         self._failures = 0
         self._error: str | None = None
 
@@ -67,14 +73,27 @@ class Sender(threading.Thread):
             error=self._error or (refused[0] if refused else None),
         )
 
-    def flush(self, timeout: float) -> bool:
-        """Wait at most `timeout` s for delivery; returns whether everything is delivered."""
+    def flush(self, timeout: float, say: Callable[[int], None] | None = None) -> bool:
+        """Wait for delivery; returns whether everything is delivered.
+
+        Args:
+            timeout: Seconds after which to stop; with `say`, seconds without any progress.
+            say: Receives the number of records that are left, while there is progress.
+        """
+        left, patience = self.pending().records, timeout
         with self._change:
             self._flushing = self._has_news = True
             self._change.notify_all()
-            self._change.wait_for(
-                lambda: not any(run.records and not run.refused for run in self._runs), timeout
-            )
+            while patience > 0 and not self._change.wait_for(
+                lambda: not any(run.records and not run.refused for run in self._runs),
+                min(patience, SAY_SECONDS),
+            ):
+                before, left = left, sum(run.records for run in self._runs)
+                if say is not None and left < before:
+                    patience = timeout
+                    say(left)
+                else:
+                    patience -= SAY_SECONDS
             self._flushing = False
         return not self.pending()
 
@@ -108,10 +127,17 @@ class Sender(threading.Thread):
         """Send everything in the queues; False if a failure ended the round."""
         with self._change:
             runs = [run for run in self._runs if run.refused is None]
-        # Metrics of running runs before policies of finished ones.
-        for run in sorted(runs, key=lambda run: not run.is_running):
-            if self._stopped or not self._send_run(run):
-                return False
+        # Metrics of running runs before those of finished ones, and policies at last.
+        runs.sort(key=lambda run: not run.is_running)
+        self._failed = False
+        for policies in (False, True):
+            left = runs
+            while left and not self._failed:
+                unsent = {run.node_key for run in left}
+                self._send_each([run for run in left if run.source not in unsent], policies)
+                left = [run for run in left if run.source in unsent]
+        if self._failed or self._stopped:
+            return False
         if self._error is not None:
             logger.warning("MLflow at %s accepts records again", self._store)
         self._failures, self._error = 0, None
@@ -121,25 +147,44 @@ class Sender(threading.Thread):
             self._runs = {run: None for run in self._runs if run.records or run.is_running}
         return True
 
-    def _send_run(self, run: RunQueue) -> bool:
+    def _send_each(self, runs: Iterable[RunQueue], policies: bool) -> None:
+        """Send to several runs at once; no more after a failure."""
+        left = deque(runs)
+
+        def send() -> None:
+            while not (self._failed or self._stopped):
+                if policies and self._has_news:  # metrics, which the next round sends first
+                    return
+                try:
+                    run = left.popleft()
+                except IndexError:
+                    return
+                self._send_run(run, policies)
+
+        threads = [Thread(target=send, daemon=True) for _ in range(min(self._at_once, len(left)))]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+
+    def _send_run(self, run: RunQueue, policies: bool) -> None:
         try:
-            run.send()
+            run.send(policy=policies)
         # The thread must survive every error; unsent records stay in the queue.
         except Exception as error:
             reason = mlflow_reason(error)
             if is_lasting(error) or isinstance(error, DamagedError):
                 run.refused = reason
                 logger.warning("MLflow at %s does not get all of a run: %s", self._store, reason)
-                return True
-            if self._error is None:
-                logger.warning(
-                    "MLflow at %s does not accept records, they wait: %s", self._store, reason
-                )
-            self._failures, self._error = self._failures + 1, reason
+                return
             with self._change:
+                if self._error is None:
+                    logger.warning(
+                        "MLflow at %s does not accept records, they wait: %s", self._store, reason
+                    )
+                self._failures, self._error = self._failures + (not self._failed), reason
+                self._failed = True
                 self._runs[run] = self._runs.pop(run)
-            return False
-        return True
 
     def _pause(self) -> None:
         longest = FIRST_PAUSE if self._flushing else LONGEST_PAUSE

@@ -7,6 +7,7 @@ constructor waits for a server; afterwards every call only fills a queue, which 
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import os
@@ -57,6 +58,8 @@ from music_rllib.tracking.store import (
 
 logger = logging.getLogger(__name__)
 
+REQUESTS_AT_ONCE = 4
+"""To a server, which has two processes by default."""
 MAX_CAUSE_LENGTH = 1000
 """Longest tag that says why a run ended, in characters; the run's log has all of it."""
 
@@ -106,7 +109,9 @@ class Tracker:
         self._experiment = Experiment(self.store, sweep_name, self.sweep_id, _plan_key(config))
         self._parent = self._parent_run(config)
         replace(record, experiment_id=self.experiment_id, run_id=self.parent_run_id).write(storage)
-        self._sender = Sender(self.store.public_uri)
+        # A SQLite file has one writer at a time.
+        at_once = REQUESTS_AT_ONCE if self.store.is_server else 1
+        self._sender = Sender(self.store.public_uri, at_once)
         self._sender.add(self._parent)
         self._sender.start()
 
@@ -203,11 +208,22 @@ class Tracker:
         """Wait at most `timeout` s for delivery; returns whether everything is delivered."""
         return self._sender.flush(timeout)
 
-    def close(self, status: Status = "FINISHED", timeout: float = 20.0) -> Pending:
-        """End the parent run, send for at most `timeout` s, and return the undelivered records.
+    def close(
+        self,
+        status: Status = "FINISHED",
+        timeout: float = 20.0,
+        say: Callable[[int], None] | None = None,
+    ) -> Pending:
+        """End the parent run, send what is left, and return the undelivered records.
 
         Unfinished runs are marked KILLED; a later sweep continues them. A second call only
         returns the same value again.
+
+        Args:
+            status: Status of the parent run.
+            timeout: Seconds after which to stop sending; with `say`, seconds without any progress.
+            say: Receives the number of records that are left, every few seconds. Ctrl-C then ends
+                the wait.
         """
         if self._undelivered is None:
             for node_key, queue in self._runs.items():
@@ -215,7 +231,8 @@ class Tracker:
                     self.end(node_key, "KILLED")
             self._parent.end(status, {})
             self._sender.add(self._parent)
-            self._sender.flush(timeout)
+            with contextlib.suppress(*(() if say is None else (KeyboardInterrupt,))):
+                self._sender.flush(timeout, say)
             self._sender.stop()
             self._sender.join(1.0)  # a request that is being sent ends by itself, and is harmless
             self._undelivered = self._sender.pending()
@@ -370,10 +387,13 @@ def finished_run(store: NodeStore, node: Node) -> StoredRun:
     Raises:
         DamagedError: The run's history cannot be read.
     """
-    reports, policy = store.history(node.key), None
+    return StoredRun(store.history(node.key), partial(_policy, store, node))
+
+
+def _policy(store: NodeStore, node: Node) -> bytes | None:
     try:
         with store.files(node.key) as folder:
-            policy = policy_from_folder(folder, [node.run.task]).to_bytes()
+            return policy_from_folder(folder, [node.run.task]).to_bytes()
     except (OSError, ValueError, StorageError) as error:
         logger.warning("MLflow gets no policy of %s: %s", node.label, error)
-    return StoredRun(reports, policy)
+        return None

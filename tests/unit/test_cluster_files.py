@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 import yaml
 from jsonschema import Draft7Validator
+from ray.scripts.scripts import start
 
 import music_rllib
 from cluster.check import (
@@ -33,6 +34,7 @@ from music_rllib.config.load import load_config
 ROOT = Path(__file__).parents[2]
 CLUSTER = ROOT / "cluster"
 JOB, RAY = "kuberay/rayjob/rayjob.yaml", "kuberay/raycluster/raycluster.yaml"
+LATER = "kuberay/raycluster-1.7/kustomization.yaml"
 
 
 @pytest.fixture(autouse=True)
@@ -93,6 +95,15 @@ def put(place: str, value: Any) -> Change:
             document[int(last)] = value
         else:
             document[last] = value
+
+    return change
+
+
+def patch(old: str, new: str) -> Change:
+    def change(document: Any) -> None:
+        (entry,) = document["patches"]
+        assert old in entry["patch"]
+        entry["patch"] = entry["patch"].replace(old, new)
 
     return change
 
@@ -167,6 +178,11 @@ NODE = "available_node_types/cpu/node_config"
         (RAY, put("spec/workerGroupSpecs/0/suspend", True), "suspend: must be false"),
         (RAY, put("spec/workerGroupSpecs/0/scaleStrategy", {"workers": []}), "workers"),
         (RAY, put("spec/gcsFaultToleranceOptions", {}), "redisAddress"),
+        (RAY, put("spec/gcsFaultToleranceOptions", {"backend": "rocksbd"}), "rocksbd"),
+        (RAY, put("spec/networkPolicy", {"mode": "Deny"}), "Deny"),
+        (LATER, patch("mode: DenyAllIngress", "modes: DenyAll"), "patches.0: spec.networkPolicy"),
+        (LATER, patch("size: 1Gi", "size: 1 GB"), "patches.0: spec.gcsFaultToleranceOptions.stor"),
+        (LATER, patch("name: music-rllib", "name: other"), "must be of an object of the resources"),
         (RAY, put("spec/upgradeStrategy", {"type": "Rolling"}), "Rolling"),
         (RAY, put("spec/autoscalerOptions/idleTimeoutSeconds", -1), "idleTimeoutSeconds"),
         ("kuberay/storage/storage.yaml", put("spec/accessMode", []), "accessMode"),
@@ -505,6 +521,21 @@ def test_grafana_finds_its_dashboards_and_prometheus() -> None:
     assert set(discovery["names"]) <= set(services)
     for name in discovery["names"]:
         assert f"--metrics-export-port={discovery['port']}" in services[name]["command"]
+
+
+def test_the_unit_of_a_node_starts_ray_with_known_options(tmp_path: Path) -> None:
+    text = (CLUSTER / "ray-node.service").read_text()
+    (program, action, *_) = re.findall("^ExecStart=(.*)$", text, re.MULTILINE)[0].split()
+    assert (Path(program).name, action) == ("ray", start.name)
+    known = {name for option in start.params for name in option.opts}
+    assert {*re.findall(r"(--[a-z-]+)[= ']", text)} - {"--now"} <= known
+    if (verifier := shutil.which("systemd-analyze")) is not None:
+        unit = tmp_path / "ray-node.service"
+        unit.write_text(text.replace(program, "/bin/true"))
+        done = subprocess.run(
+            [verifier, "verify", unit], capture_output=True, text=True, check=False
+        )
+        assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_prometheus_takes_its_configuration(require_service: Callable[[str], Path]) -> None:

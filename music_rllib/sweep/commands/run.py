@@ -118,6 +118,16 @@ RetrainDamaged = Annotated[
         "names them and starts nothing.",
     ),
 ]
+WaitForNodes = Annotated[
+    float | None,
+    typer.Option(
+        metavar="MINUTES",
+        min=0,
+        help="Time to wait for nodes of a cluster that can hold a run. Default: 5 minutes if no "
+        "node has CPUs yet, as after a restart of the head; otherwise 0.",
+        show_default=False,
+    ),
+]
 
 
 def run(
@@ -130,6 +140,7 @@ def run(
     retrain: Retrain = None,
     keep_runs: KeepRuns = False,
     retrain_damaged: RetrainDamaged = False,
+    wait_for_nodes: WaitForNodes = None,
     json: Json = False,
 ) -> int:
     """Train every run of a sweep and log them to MLflow."""
@@ -141,6 +152,7 @@ def run(
         retrain=retrain or (),
         keep_runs=keep_runs,
         retrain_damaged=retrain_damaged,
+        wait_minutes=wait_for_nodes,
         as_json=json,
     )
 
@@ -179,6 +191,7 @@ def resume(
     retrain: Retrain = None,
     keep_runs: KeepRuns = False,
     retrain_damaged: RetrainDamaged = False,
+    wait_for_nodes: WaitForNodes = None,
     json: Json = False,
 ) -> int:
     """Resume a stopped or killed sweep, using the configuration kept in its storage."""
@@ -191,6 +204,7 @@ def resume(
         retrain=retrain or (),
         keep_runs=keep_runs,
         retrain_damaged=retrain_damaged,
+        wait_minutes=wait_for_nodes,
         as_json=json,
     )
 

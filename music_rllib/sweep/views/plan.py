@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from music_rllib import names
-from music_rllib.command_line import new_table
+from music_rllib.command_line import clock, new_table
 from music_rllib.config.load import warnings_of
 from music_rllib.config.schema import Source, Stage, SweepConfig
 from music_rllib.config.search import SearchSettings
@@ -27,7 +27,11 @@ from music_rllib.redaction import redact
 from music_rllib.schedules import Linear, Measured, Piecewise, value_at
 
 if TYPE_CHECKING:
+    from music_rllib.runtime.ray_cluster import Capacity
     from music_rllib.sweep.views.budget import SearchBudget
+
+SAMPLED = 50
+"""Largest number of finished runs whose speed is averaged."""
 
 
 def plan_view(config: SweepConfig, plan: Plan, finished: Collection[str]) -> RenderableType:
@@ -189,6 +193,40 @@ def plan_answer(opened: OpenSweep, changes: str) -> dict[str, Any]:
         "alpha": alpha_rows(plan),
         "changes": changes or None,
     }
+
+
+def cluster_answer(opened: OpenSweep, capacity: Capacity) -> dict[str, Any]:
+    """The room of a cluster, and the time that the runs left take on it, as plain data.
+
+    The time is computed from the speed of finished runs of the plan; null if there are none.
+    """
+    finished = opened.finished
+    left = [node for node in opened.plan.nodes if node.key not in finished]
+    keys = sorted(finished)[:SAMPLED]
+    done = [result for result in opened.store.map(opened.store.result, keys) if result is not None]
+    steps = sum(result.env_steps for result in done)
+    seconds = None
+    if steps:
+        pace = sum(result.seconds for result in done) / steps
+        budgets = [node.run.env_steps for node in left]
+        seconds = pace * max(sum(budgets) / capacity.at_once, max(budgets, default=0))
+    return {
+        "nodes": capacity.nodes,
+        "runs_at_once": capacity.now,
+        "grows": capacity.grows,
+        "runs_left": len(left),
+        "expected_seconds": seconds,
+    }
+
+
+def cluster_text(address: str, answer: Mapping[str, Any]) -> str:
+    """The answer as a sentence: `Cluster head:6379: 3 nodes hold 8 runs at a time. ...`."""
+    nodes = "1 node holds" if answer["nodes"] == 1 else f"{answer['nodes']} nodes hold"
+    text = f"Cluster {address}: {nodes} {in_runs(answer['runs_at_once'])} at a time"
+    left, seconds = in_runs(answer["runs_left"]), answer["expected_seconds"]
+    if seconds is None:
+        return f"{text}. 'plan --measure' estimates the duration of the {left} left."
+    return f"{text}. The {left} left take about {clock(seconds)}, at the speed of finished runs."
 
 
 # -- alpha ----------------------------------------------------------------------------------------

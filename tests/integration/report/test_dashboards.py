@@ -43,6 +43,7 @@ def variables() -> list[tuple[str, str]]:
     found = [
         re.fullmatch(r"label_values\((\w+), (\w+)\)", variable["query"]["query"])
         for variable in dashboard()["templating"]["list"]
+        if variable["type"] == "query"
     ]
     return [(match[1], match[2]) for match in found if match is not None]
 
@@ -59,7 +60,14 @@ def test_the_provisioning_is_consistent() -> None:
     sources = yaml.safe_load((grafana / "provisioning/datasources/prometheus.yml").read_text())
     (source,) = sources["datasources"]
     panels = dashboard()["panels"]
-    assert {panel["datasource"]["uid"] for panel in panels} == {source["uid"]}
+    # The user can choose another data source; the provisioned one is the default.
+    (chosen, *_) = dashboard()["templating"]["list"]
+    assert (chosen["type"], chosen["query"]) == ("datasource", source["type"])
+    assert chosen["current"]["value"] == source["uid"]
+    uids = {panel["datasource"]["uid"] for panel in panels}
+    uids |= {target["datasource"]["uid"] for panel in panels for target in panel["targets"]}
+    assert uids == {f"${{{chosen['name']}}}"}
+    assert all(panel["description"].endswith(".") for panel in panels)
     assert len({panel["id"] for panel in panels}) == len(panels)
     places = [panel["gridPos"] for panel in panels]
     for place in places:

@@ -158,13 +158,13 @@ def small(document: dict[str, Any]) -> dict[str, Any]:
 
 
 def run_sweep(
-    head: Head, document: dict[str, Any], folder: Path
+    head: Head, document: dict[str, Any], folder: Path, command: str = "run"
 ) -> subprocess.CompletedProcess[str]:
     """With `RAY_ADDRESS`, from a folder of the user's."""
     (folder / "sweep.yaml").write_text(yaml.safe_dump(document, sort_keys=False))
     path = os.pathsep.join((str(REPOSITORY), str(ENVIRONMENTS)))
     return subprocess.run(
-        [sys.executable, "-m", "music_rllib.sweep", "sweep.yaml"],
+        [sys.executable, "-m", "music_rllib.sweep", command, "sweep.yaml"],
         cwd=folder,
         env=head.environment | {"RAY_ADDRESS": head.address, "PYTHONPATH": path},
         capture_output=True,
@@ -191,6 +191,11 @@ def test_two_runs_at_a_time_on_two_nodes(
     assert (done.returncode, done.stderr) == (0, ""), done.stdout
     assert len(list(folder.iterdir())) == 2
     assert len(list((tmp_path / "results" / "nodes").iterdir())) == 2
+    document["seeds"] = [0, 1, 2, 3]
+    planned = run_sweep(head, document, tmp_path, "plan")
+    assert f"Cluster {head.address}: 2 nodes hold 2 runs at a time. The 2 runs left take " in (
+        planned.stdout
+    )
 
 
 def test_more_cpus_than_any_node_has(

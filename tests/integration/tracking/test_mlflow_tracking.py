@@ -59,7 +59,8 @@ def later(steps: Iterable[int]) -> list[Report]:
 
 
 def stored(steps: Iterable[int] = (), policy: bytes | None = None) -> Callable[[], StoredRun]:
-    return lambda: StoredRun([report(step, time=step) for step in steps], policy)
+    read_policy = None if policy is None else lambda: policy
+    return lambda: StoredRun([report(step, time=step) for step in steps], read_policy)
 
 
 def run_info(node_key: str, **changes: object) -> RunInfo:

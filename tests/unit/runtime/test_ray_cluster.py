@@ -133,6 +133,37 @@ def test_a_run_that_does_not_fit_is_refused_on_a_fixed_cluster(
         _capacity(Resources(gpus_per_run=1))
 
 
+def test_a_sweep_waits_for_nodes_after_a_restart_of_the_head(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Without a worker the largest node has 0 CPUs, which is not the fault of the sweep."""
+    said: list[str] = []
+    monkeypatch.setattr(ray_cluster, "start_ray", lambda **_: None)
+    monkeypatch.setattr(ray_cluster, "LOOK_SECONDS", 0.01)
+    put_cluster(monkeypatch, {}, group=None)
+
+    def say(message: str) -> None:
+        said.append(message)
+        put_cluster(monkeypatch, {}, SMALL, group=None)
+
+    with ray_cluster.cluster(Resources(), None, say) as capacity:
+        assert (capacity.now, capacity.nodes) == (4, 2)
+    assert said[0].endswith("; waiting up to 5 minutes for nodes (--wait-for-nodes)")
+    put_cluster(monkeypatch, {}, group=None)
+    for minutes in (0.0, 0.001):
+        with (
+            pytest.raises(ClusterError, match=r"no node with CPUs has joined its head yet"),
+            ray_cluster.cluster(Resources(), minutes),
+        ):
+            pass
+    put_cluster(monkeypatch, HEAD, group=None)
+    with (
+        pytest.raises(ClusterError, match=r"got 2$"),
+        ray_cluster.cluster(Resources(cpus_per_run=2)),
+    ):
+        pass
+
+
 def test_many_runs_wait_if_nodes_are_added_for_them(monkeypatch: pytest.MonkeyPatch) -> None:
     """One run fits. If only one more waited, the cluster would add one node at a time."""
     put_cluster(monkeypatch, HEAD)

@@ -38,7 +38,7 @@ from music_rllib.store import storage as storage_module
 from music_rllib.store.handoff import write_handoff
 from music_rllib.store.history import HISTORY, Report, RunResult, to_json_lines
 from music_rllib.store.storage import DamagedError, StorageFolder
-from music_rllib.sweep import clean, driver, driver_lock
+from music_rllib.sweep import clean, driver, driver_lock, execution
 from music_rllib.sweep.export import sweep_of_run
 from music_rllib.sweep.listeners.state_file import StateFile
 from music_rllib.sweep.preflight import import_checkpoints
@@ -808,3 +808,17 @@ def test_reused_runs_count_as_finished_in_the_lines_of_stages(tmp_path: Path, st
             {"name": "train", "runs": {"waiting": 3, "reused": 4, "finished": 1}}
         ]
         assert state_file.headline()[0] == ["train: 5 finished (4 reused), 3 waiting"]
+
+
+def test_a_report_made_on_another_machine_can_be_opened_on_this_one() -> None:
+    page = "http://mlflow:5000/#/experiments/1/runs/2"
+    output = (
+        f"missing: x\nReport: /head/r/index.html\nPicture: /head/a.png\nAttached to MLflow: {page}"
+    )
+    lines = execution.elsewhere(output, "s3://bucket/sweeps/s")
+    assert lines[:2] == [
+        f"Attached to MLflow: {page}",
+        "On your machine: music-rllib report s3://bucket/sweeps/s",
+    ]
+    assert lines[2].startswith("Report: /head/r/index.html (on ")
+    assert execution.elsewhere("error: no", "s3://b/s") == []

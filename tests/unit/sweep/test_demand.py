@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,6 +15,7 @@ from music_rllib.runtime.ray_cluster import Capacity
 from music_rllib.sweep.preflight import (
     DemandError,
     _network_numbers,
+    check_demand,
     check_memory,
     long_runs,
 )
@@ -101,37 +103,12 @@ def test_a_run_of_years_prints_one_warning(tmp_path: Any, defaults: dict[str, An
     assert line.startswith("stage a: a run on FetchPush takes at least ")
 
 
-def test_a_cluster_is_only_asked_if_runs_need_much_memory(
-    tmp_path: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The largest node counts, unless an autoscaler may add larger ones."""
-    import contextlib
-    from types import SimpleNamespace
-
-    from music_rllib.sweep import preflight
-
-    asked: list[Any] = []
-    room = Capacity(now=1, memory=4 * GIB)
-
-    @contextlib.contextmanager
-    def cluster(resources: Any) -> Any:
-        asked.append(resources)
-        yield room
-
-    monkeypatch.setattr("music_rllib.runtime.ray_cluster.cluster", cluster)
-    monkeypatch.setattr("music_rllib.sweep.preflight.check_reachable", lambda _: None)
-    monkeypatch.setenv("RAY_ADDRESS", "head:6379")
-
-    def check(**defaults: Any) -> list[str]:
-        node = SimpleNamespace(stage="a", key="k", run=run(tmp_path, **defaults))
-        config = SimpleNamespace(stages=(), resources="those")
-        plan = SimpleNamespace(nodes=[node])
-        return preflight.check_demand(SimpleNamespace(plan=plan, config=config, finished=set()))  # type: ignore[arg-type]
-
-    assert (check(), asked) == ([], [])
-    huge = {"tac": {"hidden_sizes": [20_000, 20_000]}}  # 25 GiB
+def test_the_largest_node_of_a_cluster_must_hold_a_run(tmp_path: Any) -> None:
+    """Unless an autoscaler may add larger ones."""
+    asked = run(tmp_path, tac={"hidden_sizes": [20_000, 20_000]})  # 25 GiB
+    node = SimpleNamespace(stage="a", key="k", run=asked)
+    config, plan = SimpleNamespace(stages=()), SimpleNamespace(nodes=[node])
+    sweep: Any = SimpleNamespace(plan=plan, config=config, finished=set())
     with pytest.raises(DemandError, match=r"of the cluster's largest node, 4\.0 GiB, got"):
-        check(**huge)
-    assert asked == ["those"]
-    room = Capacity(now=0, grows=True, memory=4 * GIB)
-    assert check(**huge) == []
+        check_demand(sweep, Capacity(now=1, memory=4 * GIB).node_memory)
+    assert check_demand(sweep, Capacity(now=0, grows=True, memory=4 * GIB).node_memory) == []
