@@ -29,6 +29,7 @@ GROUPS = {
     "memory": "memory",
     "sweep": "sweep",
     "warm": "warm_workers",
+    "driver": "driver",
     "search": "search",
     "report": "report",
 }

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import math
 import os
+import shutil
 import socket
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,6 +30,8 @@ from music_rllib import names
 REACH_SECONDS = 5.0
 SOCKET_BYTES = 107
 """Maximum length of a UNIX socket's path on Linux."""
+LOCK = "lock"
+"""File in a folder of `own_folder`, which its process has locked."""
 RAY_FOLDER = "mr-"
 """Prefix of a local Ray's folder."""
 LONGEST_SOCKET = len(
@@ -88,6 +94,32 @@ def ray_parent() -> Path:
         f"RAY_TMPDIR must be a writable folder with a path of at most {most} bytes, for Ray's "
         f"sockets; got none among {', '.join(dict.fromkeys(map(str, places)))}"
     )
+
+
+@contextlib.contextmanager
+def own_folder(prefix: str, parent: Path | None = None) -> Iterator[str]:
+    """A new private folder, which is removed at the end.
+
+    If this process is killed, the next call of this user with the same arguments removes it.
+    """
+    parent = Path(tempfile.gettempdir()) if parent is None else parent
+    for folder in parent.glob(f"{prefix}*"):
+        _remove_if_left(folder)
+    made = tempfile.TemporaryDirectory(prefix=prefix, dir=parent, ignore_cleanup_errors=True)
+    with made as name, Path(name, "new").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # until this process ends
+        Path(lock.name).rename(Path(name, LOCK))
+        yield name
+
+
+def _remove_if_left(folder: Path) -> None:
+    """Remove a folder of `own_folder` if its process has ended."""
+    with contextlib.suppress(OSError):  # no folder with a lock, or its process lives
+        if folder.is_symlink() or folder.stat().st_uid != os.getuid():
+            return
+        with (folder / LOCK).open() as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def check_cpus(resources: Resources) -> int | None:

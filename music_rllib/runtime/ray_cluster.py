@@ -7,7 +7,6 @@ import logging
 import math
 import os
 import socket
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -25,6 +24,7 @@ from music_rllib.runtime.machine import (
     check_cpus,
     cluster_address,
     free_memory,
+    own_folder,
     ray_parent,
 )
 from music_rllib.runtime.quiet import quiet_third_parties
@@ -98,10 +98,8 @@ def start_ray(**local_options: Any) -> None:
     options: dict[str, Any] = {}
     if address is None:
         # Every user can write to Ray's folder and its sockets, so its parent is private.
-        folder = tempfile.TemporaryDirectory(
-            prefix=RAY_FOLDER, dir=ray_parent(), ignore_cleanup_errors=True
-        )
-        options = {"_temp_dir": f"{_files.enter_context(folder)}/r", **local_options}
+        folder = _files.enter_context(own_folder(RAY_FOLDER, ray_parent()))
+        options = {"_temp_dir": f"{folder}/r", **local_options}
         # Never another Ray that runs on this machine.
         options |= {"address": "local", "include_dashboard": False}
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import socket
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -11,6 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
+from music_rllib import names
 from music_rllib.config.run_settings import handed_over
 from music_rllib.envs.fingerprint import (
     Fingerprint,
@@ -42,6 +44,8 @@ if TYPE_CHECKING:
 
 SECONDS = "seconds"
 """File in a checkpoint: training time so far."""
+VERSIONS = "versions.json"
+"""File in a checkpoint: the versions of the program that trained it, and changes of them."""
 
 
 class RunStorage:
@@ -59,6 +63,8 @@ class RunStorage:
         self._waits = False
         self._environment: Fingerprint | None = None
         """Fingerprint on this machine, stored with all results; None before the check."""
+        self._changes: list[str] = []
+        """Changes of versions during the run."""
 
     @cached_property
     def store(self) -> NodeStore:
@@ -199,8 +205,25 @@ class RunStorage:
             training.restore(saved, other_run=bool(other_run))
             history = from_json_lines((saved.folder / HISTORY).read_bytes())
             seconds = float((saved.folder / SECONDS).read_text())
-        self._note(f"continues {other_run}at {training.env_steps:,} env steps")
+            text = f"continues {other_run}at {training.env_steps:,} env steps"
+            if change := self._version_change(saved.folder / VERSIONS):
+                self._changes.append(f"at {training.env_steps:,} env steps: {change}")
+                text += f", under other versions than before: {change}"
+        self._note(text)
         return history, seconds
+
+    def _version_change(self, file: Path) -> str | None:
+        """The versions that changed since a checkpoint with this file; None if none did."""
+        if not file.exists():  # of an earlier version of the package
+            return None
+        known = json.loads(file.read_bytes())
+        before, now = known["versions"], provenance_tags()
+        self._changes = known["changes"]
+        changed = [name for name in sorted(before | now) if before.get(name) != now.get(name)]
+        return ", ".join(
+            f"{name.removeprefix(names.TAG_VERSION_PREFIX)} {before.get(name)} -> {now.get(name)}"
+            for name in changed
+        )
 
     # -- writing -----------------------------------------------------------------------------
 
@@ -217,7 +240,7 @@ class RunStorage:
         self.lease.check()
         with self.work.new_checkpoint(training.env_steps, self._environment) as new:
             training.save(new)
-            _write_progress(new, history, seconds)
+            self._write_progress(new, history, seconds)
             weights = training.network_weights()
             acting = {name: weights[name] for name in weights if name in {"policy", "normaliser"}}
             with contextlib.suppress(ValueError):  # not finite: the end of the run fails
@@ -242,6 +265,8 @@ class RunStorage:
             (folder / HISTORY).write_bytes(to_json_lines(history))
             self._write_handoff(folder, training, training.network_weights())
             tags = provenance_tags()
+            if self._changes:
+                tags = {**tags, names.TAG_VERSIONS_CHANGED: "; ".join(self._changes)}
             self.store.publish(self._job.key, folder, result, self._environment, tags)
 
     def _write_handoff(
@@ -265,11 +290,14 @@ class RunStorage:
                 return
             with kept.new_checkpoint(training.env_steps, self._environment) as new:
                 training.save(new, alone=True)
-                _write_progress(new, history, seconds)
+                self._write_progress(new, history, seconds)
         except (StorageError, OSError) as error:
             self._note(f"keeps no checkpoint for longer training: {error}")
 
-
-def _write_progress(new: NewCheckpoint, history: Sequence[Report], seconds: float) -> None:
-    (new.folder / SECONDS).write_text(repr(seconds))
-    (new.folder / HISTORY).write_bytes(to_json_lines(history))
+    def _write_progress(
+        self, new: NewCheckpoint, history: Sequence[Report], seconds: float
+    ) -> None:
+        versions = {"versions": provenance_tags(), "changes": self._changes}
+        (new.folder / VERSIONS).write_text(json.dumps(versions))
+        (new.folder / SECONDS).write_text(repr(seconds))
+        (new.folder / HISTORY).write_bytes(to_json_lines(history))

@@ -6,7 +6,6 @@ import contextlib
 import logging
 import os
 import shutil
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Protocol
@@ -18,7 +17,7 @@ from ray.tune.search import Searcher
 from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.scheduler import Listener, Scheduler, Status
-from music_rllib.runtime.machine import cluster_address
+from music_rllib.runtime.machine import cluster_address, own_folder
 from music_rllib.runtime.ray_cluster import cluster
 from music_rllib.store.storage import below, encoded
 from music_rllib.training.job import NodeJob
@@ -205,9 +204,7 @@ def _tune_folder(sweep: OpenSweep) -> Iterator[str]:
     """A folder for Tune's files, which are never read; every machine of the cluster reaches it."""
     if cluster_address() is None:
         # Not in the storage: if that is full, Tune must not stop the runs.
-        with tempfile.TemporaryDirectory(
-            prefix="music-tune-", ignore_cleanup_errors=True
-        ) as folder:
+        with own_folder("music-tune-") as folder:
             yield folder
         return
     if "://" in sweep.storage:

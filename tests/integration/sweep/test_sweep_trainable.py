@@ -32,7 +32,7 @@ from music_rllib.store.handoff import read_handoff
 from music_rllib.store.history import from_json_lines
 from music_rllib.store.node_store import NodeStore
 from music_rllib.training import run as run_module
-from music_rllib.training import sample_run
+from music_rllib.training import run_storage, sample_run
 from music_rllib.training.job import NodeJob
 from music_rllib.training.run import TrainingRun, _means, _training_metrics
 from music_rllib.training.worker import CAUSE, NOTES, REPORTS, RunTrainable
@@ -330,15 +330,23 @@ def test_a_finished_node_is_not_trained_again(pretrained: NodeJob) -> None:
 
 
 @pytest.mark.usefixtures("local_ray")
-def test_a_damaged_checkpoint_is_skipped_with_a_note(tmp_path: Path) -> None:
+def test_a_damaged_checkpoint_is_skipped_and_a_new_version_is_noted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     node = job(tmp_path, settings("tac"))
+    versions = {"version.torch": "2", "version.music-rllib": "0.1.0"}
+    monkeypatch.setattr(run_storage, "provenance_tags", lambda: versions)
     compute(node, steps=3)
+    versions = versions | {"version.music-rllib": "0.2.0"}
     newest = NodeStore(str(tmp_path)).work_folder(node.key).names()[-1]
     (tmp_path / "work" / node.key / newest / "history.jsonl").write_bytes(b"")
-    notes = compute(node, steps=1)[0][NOTES]
+    notes = compute(node)[0][NOTES]
     assert len(notes) == 2
     assert newest in notes[0]
-    assert notes[1] == "continues at 200 env steps"
+    change = "music-rllib 0.1.0 -> 0.2.0"
+    assert notes[1] == f"continues at 200 env steps, under other versions than before: {change}"
+    record = (tmp_path / "nodes" / node.key / "manifest.json").read_text()
+    assert f'"{names.TAG_VERSIONS_CHANGED}": "at 200 env steps: {change}"' in record
 
 
 @pytest.mark.usefixtures("local_ray")

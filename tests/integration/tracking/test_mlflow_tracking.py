@@ -12,7 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mlflow
 import numpy as np
@@ -27,6 +27,7 @@ from music_rllib.experiment.run_info import RunInfo
 from music_rllib.experiment.sweep_files import SweepLocation
 from music_rllib.policy import PolicyNetwork
 from music_rllib.store.history import Report
+from music_rllib.tracking import sender
 from music_rllib.tracking.policy_model import write_model
 from music_rllib.tracking.run_queue import StoredRun
 from music_rllib.tracking.tracker import SweepRun, Tracker
@@ -385,6 +386,38 @@ def policy(tmp_path: Path) -> Path:
     return file
 
 
+def test_many_reused_runs_are_sent_in_few_requests_for_as_long_as_it_takes(
+    tracker_on: MakeTracker, policy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Histories before policies; the end waits while there is progress."""
+    calls: list[str] = []
+
+    def slow(name: str) -> None:
+        request = getattr(MlflowClient, name)
+
+        def call(*arguments: Any, **options: Any) -> Any:
+            calls.append(name)
+            time.sleep(0.1)
+            return request(*arguments, **options)
+
+        monkeypatch.setattr(MlflowClient, name, call)
+
+    tracker = tracker_on()
+    assert tracker.flush(20.0)
+    for name in ("create_run", "get_run", "log_batch", "set_terminated", "create_logged_model"):
+        slow(name)
+    monkeypatch.setattr(sender, "SAY_SECONDS", 0.5)
+    keys = [f"run{number}" for number in range(6)]
+    for key in keys:
+        tracker.mirror(run_info(key), stored(STEPS, policy.read_bytes()))
+    said: list[int] = []
+    assert not tracker.close(timeout=3.0, say=said.append)
+    assert calls[:18] == ["create_run", "log_batch", "set_terminated"] * 6
+    assert calls.count("create_logged_model") == 6
+    assert said == sorted(said, reverse=True)
+    assert said
+
+
 # Loads the model where this package can't be imported, and acts.
 ELSEWHERE = """
 import sys, warnings
@@ -484,7 +517,7 @@ def test_a_deleted_run_does_not_delay_the_others(
     for key in ("gone", "kept"):
         tracker.mirror(run_info(key), stored([2000, 4000]))
     left = tracker.close(timeout=20.0)
-    assert left.records == 1
+    assert left.records == 2, "its history and its policy"
     assert "does not get all of a run" in caplog.text
     message = tracker.undelivered_message()
     assert message is not None

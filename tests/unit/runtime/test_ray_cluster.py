@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import shutil
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -12,7 +15,7 @@ import ray
 
 from music_rllib.config.schema import Resources
 from music_rllib.runtime import ray_cluster
-from music_rllib.runtime.machine import ClusterError, ray_parent
+from music_rllib.runtime.machine import ClusterError, own_folder, ray_parent
 from music_rllib.runtime.ray_cluster import WAITING, Capacity, _capacity, slots
 
 GIB = 2.0**30
@@ -51,6 +54,37 @@ def test_a_local_ray_has_a_short_private_folder(
     monkeypatch.setattr(os, "access", lambda path, mode: path == long)
     with pytest.raises(ClusterError, match=r"RAY_TMPDIR must be a writable folder .* at most \d\d"):
         ray_parent()
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from music_rllib.runtime.machine import own_folder
+with own_folder("music-tune-", Path(sys.argv[1])) as folder:
+    Path(folder, "file").touch()
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_folders_of_killed_processes_are_removed_at_the_next_start(tmp_path: Path) -> None:
+    """And no others: of living processes, of other users, or without a lock."""
+    subprocess.run([sys.executable, "-c", KILLED, tmp_path], check=False)
+    (killed,) = tmp_path.iterdir()
+    assert killed.name.startswith("music-tune-")
+    kept = [tmp_path / name for name in ("music-tune-notes", "other-x", "music-tune-link")]
+    for folder in kept[:2]:
+        folder.mkdir()
+    elsewhere = tmp_path.with_name(f"{tmp_path.name}-elsewhere")
+    shutil.copytree(killed, elsewhere)
+    kept[2].symlink_to(elsewhere)
+    with (
+        own_folder("music-tune-", tmp_path) as first,
+        own_folder("music-tune-", tmp_path) as second,
+    ):
+        assert {*tmp_path.iterdir()} == {*kept, Path(first), Path(second)}
+        assert Path(first).stat().st_mode & 0o777 == 0o700
+    assert {*tmp_path.iterdir()} == {*kept}
+    assert (elsewhere / "file").exists()
 
 
 @pytest.mark.parametrize(
