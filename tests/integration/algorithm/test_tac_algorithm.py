@@ -353,12 +353,9 @@ def test_q_bias_equals_its_definition() -> None:
     assert logged == pytest.approx(3.0 - np.mean(returns), rel=1e-5)
 
 
-@pytest.mark.parametrize("where", [{"num_env_runners": 1}, {"num_learners": 1}], ids=str)
-def test_remote_runners_and_learner_learn_and_resume_like_local_ones(
-    where: dict[str, int], tmp_path: Path
-) -> None:
+def test_remote_runners_and_learner_learn_and_resume_like_local_ones(tmp_path: Path) -> None:
     def remote() -> TAC:
-        return build(music=MUSIC_U, where=where)
+        return build(music=MUSIC_U, where={"num_env_runners": 1, "num_learners": 1})
 
     algo = remote()
     first = [algo.train() for _ in range(3)][-1]
