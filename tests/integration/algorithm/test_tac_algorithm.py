@@ -364,15 +364,15 @@ def test_remote_runners_and_learner_learn_and_resume_like_local_ones(tmp_path: P
     assert algo.grad_updates == 40
     before = weight_sums(algo)
     algo.save_to_path(tmp_path / "checkpoint")
+    assert algo.evaluate()["env_runners"]["episode_return_mean"] <= 0
+    algo.stop()  # its actors have both CPUs of the tests' Ray
     resumed = remote()
     resumed.restore_from_path(tmp_path / "checkpoint")
     assert weight_sums(resumed) == before
     resumed.train()
     assert weight_sums(resumed) != before
     assert (resumed.env_steps, resumed.grad_updates) == (400, 60)
-    assert algo.evaluate()["env_runners"]["episode_return_mean"] <= 0
-    for one in (algo, resumed):
-        one.stop()
+    resumed.stop()
 
 
 def register_uneven() -> None:

@@ -10,6 +10,8 @@ from typing import Any
 import pytest
 import requests
 
+from music_rllib.program import main
+from tests.integration.conftest import ENVIRONMENTS, call
 from tests.integration.mlflow_server import USER, server_script
 
 ROOT = Path(__file__).parents[3]
@@ -44,7 +46,11 @@ def holders(folder: Path, secrets: list[str]) -> list[tuple[str, str]]:
 
 
 def test_secrets_are_used_and_written_nowhere(
-    sweep_program: Any, sweep_document: dict[str, Any], mlflow_server: str, tmp_path: Path
+    sweep_program: Any,
+    sweep_document: dict[str, Any],
+    mlflow_server: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     document = sweep_document
     document["stages"] = document["stages"][:1]
@@ -52,7 +58,8 @@ def test_secrets_are_used_and_written_nowhere(
     document["mlflow"] = {"tracking_uri": mlflow_server}
     sweep_program.write(document)
 
-    code, _, errors = sweep_program.run()
+    monkeypatch.syspath_prepend(ENVIRONMENTS)
+    code, _, errors = call(main, tmp_path, "run", "sweep.yaml")
     assert code == 2, "without a password nothing must start"
     assert "401" in errors
     assert "Set MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD" in errors
