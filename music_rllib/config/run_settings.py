@@ -109,6 +109,8 @@ LAYER_KEYS = ("env_steps", "num_envs", *SECTIONS)
 
 YOUNGER: tuple[tuple[str, str], ...] = (
     ("tac", "log_std_form"), ("tac", "warmup_steps"), ("tac", "layer_norm"),
+    ("tac", "critics"), ("tac", "target_critics"), ("tac", "policy_delay"),
+    ("tac", "quantiles"), ("tac", "dropped_quantiles"),
     ("tac", "random_actions"), ("replay", "hindsight_goals"), ("replay", "n_steps"),
 )  # fmt: skip
 """Group and name of settings that are newer than the node keys of finished runs."""
@@ -215,6 +217,8 @@ class RunSettings(StrictModel):
         return Architecture(
             hidden_sizes=self.tac.hidden_sizes,
             layer_norm=self.tac.layer_norm,
+            critics=self.tac.critics,
+            quantiles=self.tac.quantiles,
             policy=self.tac.policy,
             bootstrap=self.tac.bootstrap,
             normalise_observations=self.tac.normalise_observations,

@@ -189,9 +189,24 @@ class TACSettings(StrictModel):
     bootstrap: Literal["value", "critics"] = "value"
     """Value of the next state: the target value network (the paper), or target critics at the
     policy's next action (SAC with twin targets; with one critic, DDPG)."""
-    policy_critic: Literal["first", "min"] = "min"
-    """Critic in the policy's loss: Q1 (the TAC authors) or min(Q1, Q2) (usual in SAC), which
-    exploits the overestimates of one critic less."""
+    policy_critic: Literal["first", "min", "mean"] = "min"
+    """Critic in the policy's loss: Q1 (the TAC authors), the smallest one (usual in SAC), which
+    exploits the overestimates of one critic less, or their mean (REDQ, TQC)."""
+    critics: int | None = Field(None, gt=0)
+    """Number of critics. null: 2, or 1 for `policy: deterministic` (DDPG). An update's time grows
+    with it."""
+    target_critics: int | None = Field(None, gt=0)
+    """Critics whose smallest value is used in targets, drawn at random for each update (REDQ: 2
+    of 10). Fewer of them underestimate less. null: all."""
+    quantiles: int = Field(0, ge=0)
+    """Quantiles of the return that each critic estimates (TQC: 25). 0: critics estimate its mean.
+    Needs `bootstrap: critics`."""
+    dropped_quantiles: int = Field(0, ge=0)
+    """Largest quantiles per critic that targets leave out (TQC: 2). Larger values overestimate
+    less."""
+    policy_delay: int = Field(1, gt=0)
+    """Updates of the critics for each update of the policy and of a learned alpha (TD3: 2, REDQ:
+    20). Larger values save time and let critics settle."""
     hidden_sizes: tuple[Annotated[int, Field(gt=0)], ...] = Field((256, 256, 256), min_length=1)
     """Hidden layers (ReLU) of policy, value and critics. 3 x 256 takes nearly four times as long as
     3 x 128."""
@@ -252,6 +267,11 @@ class TACSettings(StrictModel):
     """Steps after which episodes are truncated; required if the environment has no time limit."""
 
     @property
+    def critic_count(self) -> int:
+        """Number of critics."""
+        return self.critics or (1 if self.policy == "deterministic" else 2)
+
+    @property
     def steps_before_updates(self) -> int:
         """Environment steps without updates."""
         return self.random_steps if self.warmup_steps is None else self.warmup_steps
@@ -263,6 +283,25 @@ class TACSettings(StrictModel):
             raise ValueError(f"log_std_bounds must be increasing, got {low:g}, {high:g}")
         if self.target_bounds is not None and self.target_bounds[0] >= self.target_bounds[1]:
             raise ValueError(f"target_bounds must be increasing, got {list(self.target_bounds)}")
+        return self
+
+    @model_validator(mode="after")
+    def _critics_fit(self) -> Self:
+        if self.target_critics is not None and self.target_critics > self.critic_count:
+            raise ValueError(
+                f"target_critics must be <= critics ({self.critic_count}), "
+                f"got {self.target_critics}"
+            )
+        if self.quantiles and self.bootstrap == "value":
+            raise ValueError(
+                "bootstrap must be 'critics' with quantiles (a value network has no distribution), "
+                "got 'value'"
+            )
+        if self.dropped_quantiles and self.dropped_quantiles >= self.quantiles:
+            raise ValueError(
+                f"dropped_quantiles must be < quantiles ({self.quantiles}), "
+                f"got {self.dropped_quantiles}"
+            )
         return self
 
     @model_validator(mode="after")

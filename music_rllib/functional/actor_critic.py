@@ -1,10 +1,11 @@
 """Losses of the Tsallis actor-critic, paper III-B. Each is a mean over the minibatch.
 
-Shape legend: B batch, A action dimensions, C critics (two, DDPG one).
+Shape legend: B batch, A action dimensions, C critics, M quantiles of a critic, T atoms of a target.
 """
 
 from __future__ import annotations
 
+import torch.nn.functional as F
 from torch import Tensor
 
 
@@ -17,7 +18,7 @@ def critic_target(
 ) -> Tensor:
     """The critics' target (paper eq. 9), with the terminal mask that the paper leaves out.
 
-    [B] without gradient.
+    [B] without gradient; [B, T] from atoms [B, T] with the other arguments [B, 1].
 
     Args:
         reward: [B]
@@ -43,6 +44,31 @@ def critic_loss(q_values: Tensor, target: Tensor, weights: Tensor | None = None)
     return 0.5 * squares.mean(-1).sum()
 
 
+def quantile_loss(
+    quantiles: Tensor, fractions: Tensor, target: Tensor, weights: Tensor | None = None
+) -> Tensor:
+    """Quantile Huber loss, summed over the critics (TQC, Kuznetsov et al. 2020, eq. 6 and 8).
+
+    Args:
+        quantiles: [C, B, M] of the batch's actions.
+        fractions: [M] of the return's distribution below each quantile.
+        target: [B, T]
+        weights: [B] importance weights of prioritised replay.
+    """
+    error = target[:, None] - quantiles.unsqueeze(-1)
+    side = (fractions[:, None] - (error.detach() < 0).to(error)).abs()
+    losses = side * F.huber_loss(error, error.new_zeros(()).expand_as(error), reduction="none")
+    losses = losses.mean((-1, -2))
+    return (losses if weights is None else losses * weights).mean(-1).sum()
+
+
+def smallest_atoms(quantiles: Tensor, dropped: int) -> Tensor:
+    """[C, B, M] -> [B, C (M - dropped)] all critics' quantiles without the largest (TQC, eq. 7)."""
+    count, _, size = quantiles.shape
+    atoms = quantiles.transpose(0, 1).flatten(1).sort(-1).values
+    return atoms[:, : count * (size - dropped)]
+
+
 def value_target(q_of_policy: Tensor, ln_q_pi: Tensor, alpha: Tensor | float) -> Tensor:
     """The value network's target (paper eq. 8): [B] without gradient.
 
@@ -59,7 +85,9 @@ def value_loss(value: Tensor, target: Tensor) -> Tensor:
 
 
 def policy_value(q_of_policy: Tensor, policy_critic: str) -> Tensor:
-    """[C, B] -> [B]: the critic that the policy improves on: the `first` one, or their `min`."""
+    """[C, B] -> [B]: what the policy improves on: the `first` critic, or `min` or `mean` of all."""
+    if policy_critic == "mean":
+        return q_of_policy.mean(0)
     return q_of_policy[0] if policy_critic == "first" else q_of_policy.amin(0)
 
 

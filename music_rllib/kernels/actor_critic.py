@@ -3,10 +3,16 @@
 A loss is a mean over the minibatch. A derivative is by the loss's own arguments; its caller passes
 it on to the networks. Arithmetic of single numbers is in float64.
 
-Shape legend: B batch, A action dimensions, C critics.
+Shape legend: B batch, A action dimensions, C critics, M quantiles of a critic (1: its mean),
+T atoms of a target (1: its mean).
 """
 
 from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
 
 from music_rllib.kernels.compiling import compiled
 from music_rllib.kernels.layers import Array
@@ -16,56 +22,140 @@ from music_rllib.kernels.layers import Array
 def critic_target(
     reward: Array, discount: Array, next_value: Array, gamma: float, low: float, high: float
 ) -> None:
-    """Turn [B] values of next states into targets (paper eq. 9), within [low, high]."""
-    for r in range(len(next_value)):
-        target = reward[r] + gamma * discount[r] * next_value[r]
-        next_value[r] = min(max(target, low), high)
+    """Turn [B, T] values of next states into targets (paper eq. 9), within [low, high]."""
+    rows, size = next_value.shape
+    for r in range(rows):
+        for t in range(size):
+            target = reward[r] + gamma * discount[r] * next_value[r, t]
+            next_value[r, t] = min(max(target, low), high)
 
 
 @compiled
-def critic_loss(values: Array, target: Array, weights: Array, gradient: Array) -> float:
-    """1/2 mean w (Q - y)^2 (paper eq. 9), summed over critics.
+def critic_loss(
+    outputs: Array, target: Array, weights: Array, fractions: Any, gradient: Array
+) -> float:
+    """The loss of critics, summed over them, and its derivative.
 
     Args:
-        values: [C, B] critics at the batch's actions.
-        target: [B]
+        outputs: [C, B, M] critics at the batch's actions.
+        target: [B, T]
         weights: [B] importance weights, or empty for 1.
-        gradient: [C, B] receives w (Q - y) / B.
+        fractions: None: `_squared_loss`; [M] fractions of quantiles: `_quantile_loss`. The
+            compiler drops the other one.
+        gradient: [C, B, M] receives the derivative.
     """
-    rows, loss = len(target), 0.0
-    for r in range(rows):
-        weight = weights[r] if len(weights) > 0 else 1.0
-        for c in range(len(values)):
-            error = float(values[c, r]) - float(target[r])
-            loss += 0.5 * weight * error * error / rows
-            gradient[c, r] = weight * error / rows
+    if fractions is None:
+        loss: float = _squared_loss(outputs, target, weights, gradient)
+    else:
+        loss = _quantile_loss(outputs, target, weights, fractions, gradient)
     return loss
 
 
 @compiled
-def smallest_critic(values: Array) -> Array:
-    """[C, R] -> [R] values of the smallest critic; NaN if any critic is NaN."""
-    smallest: Array = values[0].copy()
-    for c in range(1, len(values)):
+def _squared_loss(outputs: Array, target: Array, weights: Array, gradient: Array) -> float:
+    """1/2 mean w (Q - y)^2 (paper eq. 9), with the derivative w (Q - y) / B."""
+    rows, loss = len(target), 0.0
+    for r in range(rows):
+        weight = weights[r] if len(weights) > 0 else 1.0
+        for c in range(len(outputs)):
+            error = float(outputs[c, r, 0]) - float(target[r, 0])
+            loss += 0.5 * weight * error * error / rows
+            gradient[c, r, 0] = weight * error / rows
+    return loss
+
+
+@compiled
+def _quantile_loss(
+    outputs: Array, target: Array, weights: Array, fractions: Array, gradient: Array
+) -> float:
+    """Mean of w |f_m - [y < z_m]| huber(y - z_m) over B, M and T (TQC, eq. 6 and 8)."""
+    count, rows, size = outputs.shape
+    loss = 0.0
+    for r in range(rows):
+        weight = weights[r] if len(weights) > 0 else 1.0
+        share = weight / (rows * size * target.shape[1])
+        for c in range(count):
+            for m in range(size):
+                cost, slope = _quantile_huber(outputs[c, r, m], target[r], fractions[m])
+                loss += share * cost
+                gradient[c, r, m] = share * slope
+    return loss
+
+
+@partial(compiled, any_order=True)
+def _quantile_huber(quantile: float, target: Array, fraction: float) -> tuple[float, float]:
+    """Sum of |f - [y < z]| huber(y - z) over targets y [T], and its derivative by z."""
+    zero, one, half = target.dtype.type(0), target.dtype.type(1), target.dtype.type(0.5)
+    below, above = target.dtype.type(1.0 - fraction), target.dtype.type(fraction)
+    cost = slope = zero
+    for t in range(len(target)):
+        error = target[t] - quantile
+        bounded = min(max(error, -one), one) * (below if error < zero else above)
+        slope -= bounded
+        cost += bounded * (error - half * min(max(error, -one), one))
+    return cost, slope
+
+
+@compiled
+def smallest_atoms(outputs: Array, dropped: int) -> Array:
+    """[C, B, M] -> [B, C (M - dropped)] all quantiles of all critics without the largest ones.
+
+    TQC, eq. 7. NaN counts as the largest number, as in `torch.sort`.
+    """
+    count, rows, size = outputs.shape
+    kept = count * (size - dropped)
+    atoms, pool = np.empty((rows, kept), outputs.dtype), np.empty(count * size, outputs.dtype)
+    for r in range(rows):
+        for c in range(count):
+            for m in range(size):
+                pool[c * size + m] = outputs[c, r, m]
+        for last in range(count * size - 1, kept - 1, -1):
+            at = 0
+            for i in range(1, last + 1):
+                if pool[i] > pool[at] or pool[i] != pool[i]:
+                    at = i
+            pool[at] = pool[last]
+        for t in range(kept):
+            atoms[r, t] = pool[t]
+    return atoms
+
+
+@compiled
+def smallest_critic(values: Array, which: Array) -> Array:
+    """[C, R] -> [R] values of the smallest of some critics; NaN if any of them is NaN."""
+    smallest: Array = values[which[0]].copy()
+    for n in range(1, len(which)):
         for r in range(len(smallest)):
-            value = values[c, r]
+            value = values[which[n], r]
             if value < smallest[r] or value != value:  # `min` would drop a NaN of a later critic
                 smallest[r] = value
     return smallest
 
 
 @compiled
-def policy_value_backward(
-    values: Array, smallest: Array, first_critic: bool, gradient: Array
-) -> None:
-    """Derivative of -mean Q (paper eq. 10), where Q is the first critic or the smallest one.
+def policy_value(values: Array, averaged: int) -> Array:
+    """[C, B] -> [B] Q of the policy's loss: the mean of the first critics; 0: the smallest one."""
+    if averaged == 0:
+        smallest: Array = smallest_critic(values, np.arange(len(values)))
+        return smallest
+    mean: Array = values[0].copy()
+    for r in range(len(mean)):
+        for c in range(1, averaged):
+            mean[r] += values[c, r]
+        mean[r] /= averaged
+    return mean
+
+
+@compiled
+def policy_value_backward(values: Array, smallest: Array, averaged: int, gradient: Array) -> None:
+    """Derivative of -mean Q (paper eq. 10), where Q is `policy_value`.
 
     As in `amin`, equal critics share the gradient, and NaN is passed on.
 
     Args:
         values: [C, B] critics at the policy's actions.
-        smallest: [B] the smallest of them.
-        first_critic: whether Q is the first critic.
+        smallest: [B] the smallest of them, unless critics are averaged.
+        averaged: number of critics whose mean is Q, the first ones; 0: Q is the smallest one.
         gradient: [C, B] receives the derivative by each critic.
     """
     count, rows = values.shape
@@ -74,8 +164,8 @@ def policy_value_backward(
         for c in range(count):
             sharing += values[c, r] == smallest[r]
         for c in range(count):
-            if first_critic:
-                gradient[c, r] = -1.0 / rows if c == 0 else 0.0
+            if averaged > 0:
+                gradient[c, r] = -1.0 / (rows * averaged) if c < averaged else 0.0
             elif values[c, r] == smallest[r]:
                 gradient[c, r] = -1.0 / (rows * sharing)
             else:

@@ -1,6 +1,6 @@
 """Adam (Kingma and Ba 2015) of all parameters at once, for compiled updates and for autograd.
 
-Shape legend: S flat parameters.
+Shape legend: S flat numbers of P parameters.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class FlatParameters:
 
 
 class AdamStep(NamedTuple):
-    """Arguments of one step of Adam. All arrays are empty if no step is to be taken."""
+    """Arguments of one step of Adam of neighboring parameters; without any, nothing is done."""
 
     values: Array
     """[S]"""
@@ -80,11 +80,25 @@ class AdamStep(NamedTuple):
     squares: Array
     """[S] second moments."""
     steps: Array
-    """[1] number of steps so far."""
+    """[P] number of steps so far, equal for all parameters."""
     lr: float
     beta1: float
     beta2: float
     eps: float
+
+    def split(self, numbers: int, parameters: int) -> tuple[AdamStep, AdamStep]:
+        """The step of the first parameters, which have that many numbers, and of all others."""
+        first, others = (
+            self._replace(
+                **{name: getattr(self, name)[some] for name in self._fields[:4]},
+                steps=self.steps[counters],
+            )
+            for some, counters in (
+                (slice(numbers), slice(parameters)),
+                (slice(numbers, None), slice(parameters, None)),
+            )
+        )
+        return first, others
 
 
 @compiled
@@ -94,7 +108,8 @@ def adam_step(step: AdamStep) -> None:
         return
     values, gradients, means, squares = step.values, step.gradients, step.means, step.squares
     number = values.dtype.type
-    step.steps[0] += 1.0
+    for p in range(len(step.steps)):
+        step.steps[p] += 1.0
     count = float(step.steps[0])
     step_size = number(step.lr / (1.0 - step.beta1**count))
     correction = number(1.0 / np.sqrt(1.0 - step.beta2**count))
@@ -120,25 +135,17 @@ class FusedAdam(torch.optim.Adam):
     def __init__(self, parameters: Iterable[Tensor], lr: float) -> None:
         super().__init__(list(parameters), lr=lr, fused=True)
         self._moments: tuple[Tensor, Tensor, Tensor] | None = None
-        """Flat first and second moments [S] and the number of steps [1], of which the state's
+        """Flat first and second moments [S] and the numbers of steps [P], of which the state's
         tensors are views; None before the first compiled step and after a loaded state."""
 
     @torch.no_grad()
     def step(self, closure: Any = None) -> Any:
         """Take one step by the parameters' gradients, without compiled code."""
-        if self._moments is not None:
-            self._separate_counters()
         return unwrap(torch.optim.Adam.step)(self, closure)
 
     def load_state_dict(self, state_dict: Any) -> None:
         unwrap(torch.optim.Adam.load_state_dict)(self, state_dict)
-        self._separate_counters()
-
-    def _separate_counters(self) -> None:
-        """Give each parameter its own step counter; compiled steps share one."""
         self._moments = None
-        for state in self.state.values():
-            state["step"] = state["step"].clone()
 
     def step_of(self, flat: FlatParameters) -> AdamStep:
         """The arguments of `adam_step` for a step of all parameters by the gradients of `flat`.
@@ -159,13 +166,13 @@ class FusedAdam(torch.optim.Adam):
     def _flattened(self, flat: FlatParameters) -> tuple[Tensor, Tensor, Tensor]:
         """Move the state into flat tensors; each parameter's state becomes views of them."""
         means, squares = torch.zeros_like(flat.values), torch.zeros_like(flat.values)
-        steps = torch.zeros(1)
+        steps = torch.zeros(len(flat.parameters))
         views = zip(flat.views(means), flat.views(squares), strict=True)
-        for parameter, (mean, square) in zip(flat.parameters, views, strict=True):
+        for p, (parameter, (mean, square)) in enumerate(zip(flat.parameters, views, strict=True)):
             if old := self.state.get(parameter):
                 mean.copy_(old["exp_avg"])
                 square.copy_(old["exp_avg_sq"])
-                steps.copy_(old["step"])
-            new = {"step": steps[0], "exp_avg": mean, "exp_avg_sq": square}
+                steps[p] = old["step"]
+            new = {"step": steps[p], "exp_avg": mean, "exp_avg_sq": square}
             self.state[parameter] = new
         return means, squares, steps

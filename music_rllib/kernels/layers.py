@@ -39,7 +39,8 @@ class Network(NamedTuple):
     """A perceptron with ReLU between its layers and a linear output.
 
     Networks with and without layer normalization have different types, so that neither's machine
-    code contains the other's.
+    code contains the other's. C networks of equal shape are one `Network` whose positions and kept
+    outputs have a leading axis C; `member` takes one of them.
     """
 
     values: Array
@@ -151,6 +152,17 @@ def layer_norm_backward(gradient: Array, normalized: Array, factor: float) -> No
 
 
 @compiled
+def member(networks: Network, c: int) -> Network:
+    """Network c of C. Those that are not trained may share the room for their outputs."""
+    at = c % len(networks.kept)
+    return Network(
+        networks.values, networks.gradients, networks.sizes, networks.weights[c],
+        networks.biases[c], networks.by_outputs, networks.kept[at],
+        _of_member(networks.normalized, at),
+    )  # fmt: skip
+
+
+@compiled
 def layer_weights(network: Network, flat: Array, layer: int) -> Array:
     """A view of a layer's weights in the flat parameters or gradients."""
     inputs, outputs = network.sizes[layer], network.sizes[layer + 1]
@@ -185,6 +197,14 @@ def _outputs_in(flat: Array, sizes: Array, layer: int, rows: int) -> Array:
 
 # The following functions get None for a network without layer normalization. The compiler then
 # drops their other branch.
+
+
+@compiled
+def _of_member(normalized: Any, at: int) -> Any:
+    """`Normalized` of one network of several."""
+    if normalized is None:
+        return None
+    return Normalized(normalized.outputs[at], normalized.inverse_std[at])
 
 
 @compiled

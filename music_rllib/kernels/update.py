@@ -3,7 +3,8 @@
 It needs no autograd, allocates no matrices of parameters, and computes only gradients that are
 used. Critics evaluate the minibatch's and the policy's actions in one pass.
 
-Shape legend: K updates, B batch, R rows, I network inputs, A action dimensions, C critics.
+Shape legend: K updates, B batch, R rows, I network inputs, A action dimensions, C critics,
+N critics of a target, M quantiles of a critic (1: its mean), T atoms of a target (1: its mean).
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ from music_rllib.kernels.actor_critic import (
     critic_target,
     policy_loss,
     policy_loss_backward,
+    policy_value,
     policy_value_backward,
+    smallest_atoms,
     smallest_critic,
     value_loss,
 )
@@ -41,6 +44,7 @@ from music_rllib.kernels.layers import (
     layer_outputs,
     layer_weights,
     linear_backward_inputs,
+    member,
 )
 
 
@@ -60,24 +64,29 @@ class UpdateSettings(NamedTuple):
     action_l2: float
     joint: bool
     """Whether the entropy is that of the joint density; otherwise it is summed over dimensions."""
-    first_critic: bool
-    """Whether the policy improves on the first critic; otherwise on the smaller one."""
+    averaged_critics: int
+    """Number of critics whose mean the policy improves on, the first ones; 0: the smallest one."""
     has_value: bool
     """Whether a value network evaluates next states; otherwise averaged critics do."""
+    fractions: Array | None
+    """[M] fractions of the critics' quantiles; None: critics are means. Like layer normalization,
+    it selects the code that is compiled."""
+    dropped_quantiles: int
+    """Number of each critic's quantiles that targets leave out, the largest ones."""
+    policy_delay: int
+    """The policy is updated in every update whose number is a multiple of this."""
 
 
 class Networks(NamedTuple):
-    """A module's networks. A missing one is an unused placeholder, which keeps the signature.
-
-    A single critic stands twice, so that modules with one and two critics share compiled code.
-    """
+    """A module's networks. A missing one is an unused placeholder, which keeps the signature."""
 
     policy: Network
-    critics: tuple[Network, Network]
-    critic_count: int
+    critics: Network
+    """C networks."""
     value: Network
     value_target: Network
-    critics_target: tuple[Network, Network]
+    critics_target: Network
+    """C networks."""
     policy_target: Network
     scratch: Array
     """[2, R * O] gradients between layers, for the most rows and the widest layer."""
@@ -102,6 +111,8 @@ class Batch(NamedTuple):
     """[K*B, A]"""
     weights: Array
     """[K*B]"""
+    target_critics: NDArray[np.int64]
+    """[K*N] critics whose smallest value is used in targets."""
 
 
 class Averages(NamedTuple):
@@ -123,11 +134,11 @@ class Learned(NamedTuple):
     """Results of K updates, for metrics."""
 
     losses: Array
-    """[K, 3] of critics, policy and value network."""
+    """[K, 3] of critics, policy and value network; 0 if the policy's was not computed."""
     q_values: Array
-    """[K, C, B] critics at the minibatch's actions."""
+    """[K, C, B] critics at the minibatch's actions, means of their quantiles."""
     target: Array
-    """[K, B] the critics' targets."""
+    """[K, B] the critics' targets, means of their atoms."""
     log_density: Array
     """[K, B, A] of the policy's actions; empty for a deterministic policy."""
     log_std: Array
@@ -166,14 +177,42 @@ def _pairs(states: Array, actions: Array, others: Array) -> Array:
 
 
 @compiled
-def _critic_values(critics: tuple[Network, Network], count: int, pairs: Array) -> Array:
-    """[R, I + A] -> [C, R]."""
-    values = np.empty((count, len(pairs)), pairs.dtype)
-    for c in range(count):
-        outputs = forward(critics[c], pairs)
+def _critic_outputs(critics: Network, which: Array, pairs: Array) -> Array:
+    """[R, I + A] -> [N, R, M] outputs of some critics."""
+    outputs = np.empty((len(which), len(pairs), critics.sizes[-1]), pairs.dtype)
+    for n in range(len(which)):
+        found = forward(member(critics, which[n]), pairs)
         for r in range(len(pairs)):
-            values[c, r] = outputs[r, 0]
-    return values
+            for m in range(found.shape[1]):
+                outputs[n, r, m] = found[r, m]
+    return outputs
+
+
+@compiled
+def _means(outputs: Array) -> Array:
+    """[C, R, M] -> [C, R]."""
+    count, rows, size = outputs.shape
+    means = np.empty((count, rows), outputs.dtype)
+    for c in range(count):
+        for r in range(rows):
+            total = outputs[c, r, 0]
+            for m in range(1, size):
+                total += outputs[c, r, m]
+            means[c, r] = total / size
+    return means
+
+
+@compiled
+def _pessimistic(outputs: Array, fractions: Any, dropped: int) -> Array:
+    """[N, B, M] outputs of critics -> [B, T] atoms of their pessimistic value.
+
+    The value of the smallest critic, or the smallest quantiles of all of them.
+    """
+    if fractions is None:
+        atoms: Array = smallest_critic(outputs[:, :, 0], np.arange(len(outputs))).reshape((-1, 1))
+    else:
+        atoms = smallest_atoms(outputs, dropped)
+    return atoms
 
 
 @compiled
@@ -181,45 +220,56 @@ def _next_values(
     networks: Networks, batch: Batch, settings: UpdateSettings, following: Array,
     next_outputs: Array, q: float, alpha: float,
 ) -> Array:  # fmt: skip
-    """[B] values of the next states by the target networks."""
+    """[B, T] values of the next states by the target networks."""
     if settings.has_value:
-        values: Array = forward(networks.value_target, following).copy().reshape(len(following))
+        values: Array = forward(networks.value_target, following).copy()
         return values
     if not settings.distribution.stochastic:
         next_outputs = forward(networks.policy_target, following)
     drawn = sample(next_outputs, batch.next_noise, settings.distribution)
     pairs = _pairs(following, drawn.action, drawn.action[:0])
-    values = smallest_critic(_critic_values(networks.critics_target, networks.critic_count, pairs))
+    outputs = _critic_outputs(networks.critics_target, batch.target_critics, pairs)
+    values = _pessimistic(outputs, settings.fractions, settings.dropped_quantiles)
     ln_q_pi = ln_q_of_policy(drawn.log_density, q, settings.joint)[0]
     for r in range(len(ln_q_pi)):
-        values[r] -= alpha * ln_q_pi[r]
+        for t in range(values.shape[1]):
+            values[r, t] -= alpha * ln_q_pi[r]
     return values
 
 
 @compiled
-def _critics_backward(networks: Networks, pairs: Array, of_values: Array, action: Array) -> Array:
+def _critics_backward(
+    networks: Networks, pairs: Array, of_outputs: Array, of_values: Array, action: Array
+) -> Array:
     """Write the critics' gradients; return [B, A] the derivative by the policy's actions.
 
     Args:
-        pairs: [2 B, I + A] inputs: the minibatch's actions, then the policy's.
-        of_values: [C, 2 B] derivatives by the critics' values. Each of the policy's actions
-            backpropagates only through critics with a derivative: half of the rows of two critics.
+        pairs: [R, I + A] inputs: the minibatch's actions, then the policy's, if they are evaluated.
+        of_outputs: [C, B, M] derivatives by the critics' outputs at the minibatch's actions.
+        of_values: [C, B] derivatives by the critics' values at the policy's actions, or [C, 0].
+            Each action backpropagates only through critics with a derivative: half of the rows of
+            two critics.
         action: [B, A] of the policy.
     """
     count, size = action.shape
-    inputs = pairs.shape[1] - size
+    inputs, quantiles = pairs.shape[1] - size, of_outputs.shape[2]
     of_action, part = np.zeros_like(action), np.empty_like(action)
-    rows, of_value = np.arange(2 * count), np.empty((2 * count, 1), action.dtype)
-    for c in range(networks.critic_count):
-        critic = networks.critics[c]
+    rows, gradient = np.arange(2 * count), np.empty((2 * count, quantiles), action.dtype)
+    for c in range(len(of_outputs)):
+        critic = member(networks.critics, c)
         for r in range(count):
-            of_value[r, 0] = of_values[c, r]
+            for m in range(quantiles):
+                gradient[r, m] = of_outputs[c, r, m]
         end = count
-        for r in range(count, 2 * count):
+        for r in range(of_values.shape[1]):
             if of_values[c, r] != 0.0:
-                rows[end], of_value[end, 0] = r, of_values[c, r]
+                rows[end] = count + r
+                for m in range(quantiles):
+                    gradient[end, m] = of_values[c, r] / quantiles
                 end += 1
-        of_hidden = backward(critic, pairs, rows[:end], of_value[:end], count, networks.scratch)
+        of_hidden = backward(critic, pairs, rows[:end], gradient[:end], count, networks.scratch)
+        if end == count:
+            continue
         weights = layer_weights(critic, critic.values, 0)[inputs:]
         linear_backward_inputs(of_hidden[count:], weights, False, part[: end - count])
         for r in range(count, end):
@@ -244,9 +294,11 @@ def _policy_backward(
 def _minibatch(batch: Batch, k: int, rows: int) -> Batch:
     """The minibatch of update k."""
     cut = slice(k * rows, (k + 1) * rows)
+    size = len(batch.target_critics) * rows // len(batch.actions)
     return Batch(
         batch.observations[cut], batch.actions[cut], batch.rewards[cut], batch.discounts[cut],
         batch.next_observations[cut], batch.noise[cut], batch.next_noise[cut], batch.weights[cut],
+        batch.target_critics[k * size : (k + 1) * size],
     )  # fmt: skip
 
 
@@ -268,9 +320,13 @@ def _empty_results(batch: Batch, stochastic: bool, updates: int, rows: int, coun
 @compiled
 def _differentiate(
     networks: Networks, batch: Batch, settings: UpdateSettings, q: float, alpha: float,
-    learned: Learned, k: int,
+    improves: bool, learned: Learned, k: int,
 ) -> None:  # fmt: skip
-    """Write all losses of a minibatch (paper III-B) and their gradients by the networks."""
+    """Write all losses of a minibatch (paper III-B) and their gradients by the networks.
+
+    Unless it `improves`, the policy gets no gradient. Then its actions are only evaluated if a
+    value network learns from them.
+    """
     rows, action_l2 = len(batch.actions), settings.action_l2
     states = _normalized(batch.observations, batch.next_observations, settings)
     # With averaged critics, one pass of the policy also gives its next actions.
@@ -285,22 +341,26 @@ def _differentiate(
         settings.target_high,
     )  # fmt: skip
 
-    pairs = _pairs(states[:rows], batch.actions, drawn.action)
-    values = _critic_values(networks.critics, networks.critic_count, pairs)
-    of_values = np.empty_like(values)
-    smallest = smallest_critic(values[:, rows:])
-    losses, first_critic = learned.losses[k], settings.first_critic
-    losses[0] = critic_loss(values[:, :rows], target, batch.weights, of_values[:, :rows])
-    policy_value_backward(values[:, rows:], smallest, first_critic, of_values[:, rows:])
-    of_action = _critics_backward(networks, pairs, of_values, drawn.action)
-
-    improved = values[0, rows:] if first_critic else smallest
-    losses[1] = policy_loss(drawn.action, ln_q_pi, improved, alpha, action_l2)
-    policy_loss_backward(drawn.action, of_action, slopes, alpha, action_l2)
-    _policy_backward(networks, settings, entered, drawn, of_action, slopes)
+    evaluated = drawn.action if improves or settings.has_value else drawn.action[:0]
+    pairs = _pairs(states[:rows], batch.actions, evaluated)
+    count = len(networks.critics.weights)
+    outputs = _critic_outputs(networks.critics, np.arange(count), pairs)
+    values, of_outputs = _means(outputs), np.empty_like(outputs[:, :rows])
+    asked, losses, fractions = values[:, rows:], learned.losses[k], settings.fractions
+    losses[0] = critic_loss(outputs[:, :rows], target, batch.weights, fractions, of_outputs)
+    of_values = np.empty((count, rows if improves else 0), values.dtype)
+    if improves:
+        improved = policy_value(asked, settings.averaged_critics)
+        policy_value_backward(asked, improved, settings.averaged_critics, of_values)
+        losses[1] = policy_loss(drawn.action, ln_q_pi, improved, alpha, action_l2)
+    of_action = _critics_backward(networks, pairs, of_outputs, of_values, drawn.action)
+    if improves:
+        policy_loss_backward(drawn.action, of_action, slopes, alpha, action_l2)
+        _policy_backward(networks, settings, entered, drawn, of_action, slopes)
     if settings.has_value:
         of_states = forward(networks.value, states[:rows])
         gradient = np.empty_like(of_states)
+        smallest = smallest_critic(asked, batch.target_critics)
         losses[2] = value_loss(of_states, smallest, ln_q_pi, alpha, gradient)
         backward(networks.value, states[:rows], np.arange(rows), gradient, rows, networks.scratch)
     for r in range(rows):  # assigning whole slices takes seconds to compile
@@ -309,7 +369,10 @@ def _differentiate(
         for a in range(drawn.log_density.shape[1]):
             learned.log_density[k, r, a] = drawn.log_density[r, a]
             learned.log_std[k, r, a] = drawn.log_std[r, a]
-        learned.target[k, r] = target[r]
+        total = target[r, 0]
+        for t in range(1, target.shape[1]):
+            total += target[r, t]
+        learned.target[k, r] = total / target.shape[1]
         learned.ln_q_pi[k, r] = ln_q_pi[r]
 
 
@@ -327,23 +390,27 @@ def _compiled_for(sources: str) -> Any:
 
     @kept_on_disk
     def learn(
-        networks: Networks, batch: Batch, settings: UpdateSettings, step: AdamStep,
-        averages: Averages, q: float, alpha: float, rows: int,
+        networks: Networks, batch: Batch, settings: UpdateSettings, policy_step: AdamStep,
+        step: AdamStep, averages: Averages, q: float, alpha: float, rows: int,
     ) -> Learned:  # fmt: skip
         """Do one update for each `rows` rows of the batch, in order.
 
-        The gradients of the last update remain. An empty `step` leaves the networks unchanged.
+        The gradients of the last update remain. Empty steps leave the networks unchanged.
         """
         sources  # noqa: B018
         updates = len(batch.actions) // rows
         learned: Learned = _empty_results(
-            batch, settings.distribution.stochastic, updates, rows, networks.critic_count
+            batch, settings.distribution.stochastic, updates, rows, len(networks.critics.weights)
         )
         for k in range(updates):
-            _differentiate(networks, _minibatch(batch, k, rows), settings, q, alpha, learned, k)
+            number = averages.done + k + 1
+            improves, some = number % settings.policy_delay == 0, _minibatch(batch, k, rows)
+            _differentiate(networks, some, settings, q, alpha, improves, learned, k)
+            if improves:
+                adam_step(policy_step)
             adam_step(step)
-            if (averages.done + k + 1) % averages.interval == 0:
-                _average(averages, step.values)
+            if number % averages.interval == 0:
+                _average(averages, networks.policy.values)
         return learned
 
     return learn

@@ -52,6 +52,8 @@ class Architecture(_Strict):
 
     hidden_sizes: tuple[int, ...]
     layer_norm: str = "none"
+    critics: int | None = None
+    quantiles: int = 0
     policy: str
     bootstrap: str
     normalise_observations: bool
@@ -67,7 +69,7 @@ class Architecture(_Strict):
             fits = self.estimator_hidden_size == other.estimator_hidden_size
             return [] if fits else ["music.hidden_size"]
         fields = ["hidden_sizes", "layer_norm", "policy", "bootstrap", "normalise_observations"]
-        fields.append("log_std_form")
+        fields += ["critics", "quantiles", "log_std_form"]
         if self.log_std_form == other.log_std_form:
             fields.append("log_std_bounds")
         return [f"tac.{name}" for name in fields if getattr(self, name) != getattr(other, name)]

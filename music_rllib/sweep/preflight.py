@@ -340,9 +340,7 @@ def _network_numbers(run: RunSettings, observation: int) -> int:
     """Numbers of all networks: weights, gradients, Adam's two moments, and target networks."""
     tac = run.tac
     policy = _weights(observation, tac.hidden_sizes)
-    critics = _weights(observation + 1, tac.hidden_sizes)
-    if tac.policy == "stochastic":
-        critics *= 2
+    critics = tac.critic_count * _weights(observation + 1, tac.hidden_sizes)
     value = policy if tac.bootstrap == "value" else 0
     return 4 * (policy + critics + value) + (value or critics)
 

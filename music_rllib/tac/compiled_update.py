@@ -94,6 +94,8 @@ class CompiledUpdate:
             (self.flat.start(online[0]), *self._averaged.extent(target)) for online, target in pairs
         ]
         self._parts = np.array(parts, np.int64).reshape(-1, 3)
+        policy = list(module.policy.parameters())
+        self._of_policy = self.flat.start(next(iter(module.critics.parameters()))), len(policy)
         self._networks = self._arguments(module)
         self._settings = _settings_of(module)
 
@@ -118,10 +120,11 @@ class CompiledUpdate:
         settings = self._module.settings
         if optimizer is None:
             empty = self.flat.values.numpy()[:0]
-            step = AdamStep(empty, empty, empty, empty, empty, 0.0, 0.0, 0.0, 0.0)
+            policy_step = step = AdamStep(empty, empty, empty, empty, empty, 0.0, 0.0, 0.0, 0.0)
             parts = self._parts[:0]
         else:
-            step, parts = optimizer.step_of(self.flat), self._parts
+            policy_step, step = optimizer.step_of(self.flat).split(*self._of_policy)
+            parts = self._parts
         averages = Averages(
             self._averaged.values.numpy(), parts, settings.tau, settings.target_update_interval,
             done,
@@ -131,11 +134,12 @@ class CompiledUpdate:
             batch[Columns.OBS], actions, rewards, batch["discounts"], batch[Columns.NEXT_OBS],
             batch.get("noise", actions[:0]), batch.get("next_noise", actions[:0]),
             batch.get("weights", rewards[:0]),
+            batch.get("target_critics", self._all_critics(rewards)),
         )  # fmt: skip
         arrays = Batch(*(values.numpy() for values in columns))
         found = learn(
-            self._networks, arrays, self._settings, step, averages, entropic_index, alpha,
-            settings.batch_size,
+            self._networks, arrays, self._settings, policy_step, step, averages, entropic_index,
+            alpha, settings.batch_size,
         )  # fmt: skip
         losses, q_values, targets, log_density, log_std, ln_q_pi = map(torch.from_numpy, found)
         critics, policy, value = losses.unbind(1)
@@ -147,30 +151,35 @@ class CompiledUpdate:
             observed |= {"log_density": log_density, "log_std": log_std}
         return Learned(named, observed, ln_q_pi)
 
+    def _all_critics(self, rewards: Tensor) -> Tensor:
+        """[K*C] every critic for each update of [K*B] rows."""
+        updates = len(rewards) // self._module.settings.batch_size
+        return torch.arange(self._module.critics.count).repeat(updates)
+
     def _arguments(self, module: TACModule) -> Networks:
         """The module's networks as kernels take them, for minibatches of its `batch_size`."""
         rows = module.settings.batch_size
         policy = _perceptron(module.policy, self.flat, 2 * rows)
-        critics = _critics(module.critics, self.flat, 2 * rows)
+        critics = _critics(module.critics, self.flat, 2 * rows, kept=module.critics.count)
         value = value_target = policy_target = policy
         critics_target = critics
         if module.settings.bootstrap == "value":
             value = _perceptron(module.value, self.flat, rows)
             value_target = _perceptron(module.value_target, self._averaged, rows)
         else:
-            critics_target = _critics(module.critics_target, self._averaged, rows)
+            critics_target = _critics(module.critics_target, self._averaged, rows, kept=1)
         if module.deterministic:
             policy_target = _perceptron(module.policy_target, self._averaged, rows)
         widest = max(module.settings.hidden_sizes)
         scratch = self.flat.values.new_empty(2, 2 * rows * widest).numpy()
         return Networks(
-            policy, critics, module.critics.count, value, value_target, critics_target,
-            policy_target, scratch,
+            policy, critics, value, value_target, critics_target, policy_target, scratch,
         )  # fmt: skip
 
 
 def _settings_of(module: TACModule) -> UpdateSettings:
     settings, normaliser = module.settings, module.normaliser
+    count, fractions = module.critics.count, module.quantile_fractions
     mean, clip = next(module.policy.parameters()).new_zeros(module.input_size), math.inf
     inverse_std = torch.ones_like(mean)
     if isinstance(normaliser, RunningNormaliser):  # it writes these in place
@@ -192,8 +201,11 @@ def _settings_of(module: TACModule) -> UpdateSettings:
         ),
         action_l2=settings.action_l2,
         joint=settings.entropy_form == "joint",
-        first_critic=settings.policy_critic == "first",
+        averaged_critics={"min": 0, "first": 1, "mean": count}[settings.policy_critic],
         has_value=settings.bootstrap == "value",
+        fractions=None if fractions is None else fractions.to(mean).numpy(),
+        dropped_quantiles=settings.dropped_quantiles,
+        policy_delay=settings.policy_delay,
     )
 
 
@@ -207,26 +219,28 @@ def _perceptron(network: Perceptron, flat: FlatParameters, rows: int) -> Network
     )
 
 
-def _critics(network: Critics, flat: FlatParameters, rows: int) -> tuple[Network, Network]:
-    """Each critic as a network of its own; a single one twice."""
+def _critics(network: Critics, flat: FlatParameters, rows: int, *, kept: int) -> Network:
+    """All critics, with room for the outputs of `kept` of them."""
     sizes = [network.weights[0].shape[1], *(weight.shape[2] for weight in network.weights)]
 
-    def critic(c: int) -> Network:
-        weights = [flat.start(weight) + c * weight[c].numel() for weight in network.weights]
-        biases = [flat.start(bias) + c * bias[c].numel() for bias in network.biases]
-        return _network(
-            flat, sizes, weights, biases, rows, by_outputs=False, layer_norm=network.layer_norm
-        )
+    def starts(parameters: nn.ParameterList) -> list[list[int]]:
+        return [
+            [flat.start(parameter) + c * parameter[c].numel() for parameter in parameters]
+            for c in range(network.count)
+        ]
 
-    return critic(0), critic(network.count - 1)
+    return _network(
+        flat, sizes, starts(network.weights), starts(network.biases), rows, kept, by_outputs=False,
+        layer_norm=network.layer_norm,
+    )  # fmt: skip
 
 
 def _network(
-    flat: FlatParameters, sizes: list[int], weights: list[int], biases: list[int], rows: int,
-    *, by_outputs: bool, layer_norm: bool,
+    flat: FlatParameters, sizes: list[int], weights: Any, biases: Any, rows: int, *kept: int,
+    by_outputs: bool, layer_norm: bool,
 ) -> Network:  # fmt: skip
     def room(numbers: int) -> Array:
-        return flat.values.new_empty(rows * numbers).numpy()
+        return flat.values.new_empty(*kept, rows * numbers).numpy()
 
     hidden = sizes[1:-1]
     return Network(

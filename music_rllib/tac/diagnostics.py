@@ -28,7 +28,7 @@ from music_rllib.functional.distribution import (
 )
 from music_rllib.replay.trajectories import Trajectory
 from music_rllib.tac.losses import TACLoss
-from music_rllib.tac.rl_module import TACModule
+from music_rllib.tac.rl_module import TACModule, mean_values
 
 
 class NonFiniteLossError(RuntimeError):
@@ -171,11 +171,12 @@ def critic_bias(
     earned[first] = rewards.cpu().numpy()[first]
     ends = {Columns.NEXT_OBS: fresh.followers[last]}
     ends |= {name: values[last] for name, values in noise.items()}
-    tail = objective.soft_value(module.forward_target(ends)).cpu().numpy()
+    tails = objective.soft_value(module.forward_target(ends))
+    tail = (tails.mean(-1) if tails.ndim == 2 else tails).cpu().numpy()
     gamma = objective.gamma
     episodes = np.split(earned, first[1:])
     realized = np.array([episode @ gamma ** np.arange(len(episode)) for episode in episodes])
     realized += ~fresh.terminated * gamma ** np.array(fresh.lengths) * tail
     inputs = torch.cat([module.normaliser(fresh.states[first]), fresh.actions[first]], -1)
-    predicted = module.critics(inputs).amin(0).cpu().numpy()
+    predicted = mean_values(module.critics(inputs)).amin(0).cpu().numpy()
     return float((predicted - realized).mean())

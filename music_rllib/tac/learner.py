@@ -36,7 +36,7 @@ from music_rllib.tac.diagnostics import FreshEpisodes, critic_bias
 from music_rllib.tac.losses import Losses, ScheduledSettings, TACLoss
 from music_rllib.tac.minibatches import Minibatch, Minibatches
 from music_rllib.tac.networks import RunningNormaliser
-from music_rllib.tac.rl_module import ESTIMATOR_MODULE, TACForward, TACModule
+from music_rllib.tac.rl_module import ESTIMATOR_MODULE, TACForward, TACModule, mean_values
 
 GRAD_UPDATES = "grad_updates"
 
@@ -201,6 +201,10 @@ class TACLearner(TorchLearner):
         policy |= self._policy_noise(policy[Columns.ACTIONS])
         rows = len(policy[Columns.ACTIONS])
         updates = rows // self._settings.batch_size
+        if (some := self._settings.target_critics) is not None:
+            size = (updates, self._settings.critic_count)
+            order = torch.rand(size, generator=self._generator, device=self._device).argsort(1)
+            policy["target_critics"] = order[:, :some].flatten()
         trajectories, first = columns.get(ESTIMATOR_MODULE), self._grad_updates == 0
         drawn = self._intrinsic.draw(updates, rows, trajectories, self._generator, first=first)
         return Minibatches(columns, drawn)
@@ -230,13 +234,18 @@ class TACLearner(TorchLearner):
 
     def _losses_of(self, forward: TACForward, batch: Mapping[str, Tensor]) -> Losses:
         """The losses; keeps the tensors of the metrics, because reading them here would wait."""
-        losses = self._objective.losses(forward, batch)
+        losses = self._objective.losses(forward, batch, improves=self._improves(self._grad_updates))
         self._losses |= losses.named
-        self._observed |= {"q_values": forward.q_values.detach(), "targets": losses.target}
+        q_values = mean_values(forward.q_values.detach())
+        self._observed |= {"q_values": q_values, "targets": losses.target}
         for name in ("log_density", "log_std"):
             if (values := getattr(forward, name)) is not None:
                 self._observed[name] = values.detach()
         return losses
+
+    def _improves(self, done: int) -> bool:
+        """Whether the update after `done` ones updates the policy."""
+        return (done + 1) % self._settings.policy_delay == 0
 
     def loss_of_trajectories(self, batch: Mapping[str, Tensor]) -> Tensor:
         """The loss of the intrinsic reward's networks; called by their module."""
@@ -252,7 +261,7 @@ class TACLearner(TorchLearner):
         learned = self._compiled.learn(policy, self._adam["networks"], self._grad_updates, q, alpha)
         self._losses |= learned.losses
         self._observed |= learned.observed
-        if "alpha" in self._adam:
+        if "alpha" in self._adam and self._improves(self._grad_updates):
             log_density, log_std = (
                 learned.observed[name][0] for name in ("log_density", "log_std")
             )
@@ -280,11 +289,17 @@ class TACLearner(TorchLearner):
         metrics = losses_of_updates | diagnostics.of_updates(outputs, self._settings, q)
         if self.config.settings.replay.priority == "td_error":
             self._td_errors = diagnostics.td_errors(outputs)
+        done = self._grad_updates - len(next(iter(outputs.values())))
         keys, table = list(metrics), torch.stack([m.float() for m in metrics.values()], dim=1)
         # A NaN never leaves the networks again, so one check per call is enough.
         diagnostics.check_finite(keys, table, self._grad_updates, q, alpha)
         log = self.metrics.log_value
         means = dict(zip(keys, table.mean(0).tolist(), strict=True))
+        if self._settings.policy_delay > 1:
+            improving = [self._improves(done + k) for k in range(len(table))]
+            losses = outputs[names.POLICY_LOSS][improving]
+            del means[names.POLICY_LOSS]
+            means |= {names.POLICY_LOSS: float(losses.mean())} if any(improving) else {}
         measured = {**means, **self._now.metrics(), **self._intrinsic.metrics(), names.ALPHA: alpha}
         for key, value in measured.items():
             log((DEFAULT_MODULE_ID, key), value, window=1)

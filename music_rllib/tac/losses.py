@@ -1,6 +1,6 @@
 """TAC's losses on one minibatch, and the current values of settings that change over a run.
 
-Shape legend: B batch, A action dimensions, C critics.
+Shape legend: B batch, A action dimensions, C critics, T atoms of a target.
 """
 
 from __future__ import annotations
@@ -147,33 +147,33 @@ class TACLoss:
         return ln_q_of_policy(log_density, self._now.entropic_index, self._settings.entropy_form)
 
     def soft_value(self, bootstrap: Bootstrap) -> Tensor:
-        """[B] value of the states, including the entropy of the policy's action."""
+        """[B] or [B, T] value of the states, including the entropy of the policy's action."""
         if bootstrap.log_density is None:
             return bootstrap.value
-        return bootstrap.value - self.alpha * self.ln_q(bootstrap.log_density)
+        bonus = self.alpha * self.ln_q(bootstrap.log_density)
+        return bootstrap.value - (bonus if bootstrap.value.ndim == 1 else bonus[:, None])
 
-    def losses(self, forward: TACForward, batch: Mapping[str, Tensor]) -> Losses:
-        """The losses of a minibatch; `batch` has the columns documented in `minibatches`."""
+    def losses(
+        self, forward: TACForward, batch: Mapping[str, Tensor], *, improves: bool = True
+    ) -> Losses:
+        """The losses of a minibatch; `batch` has the columns documented in `minibatches`.
+
+        Unless the update `improves` the policy, the total lacks the losses of policy and alpha.
+        """
         settings, alpha = self._settings, self.alpha
-        target = actor_critic.critic_target(
-            batch[Columns.REWARDS],
-            batch["discounts"],
-            self.soft_value(forward.next),
-            settings.gamma,
-            settings.target_bounds,
-        )
+        target, critic = self._critics(forward, batch)
         ln_q_pi = self.ln_q(forward.log_density)
-        critic = actor_critic.critic_loss(forward.q_values, target, batch.get("weights"))
         improved = actor_critic.policy_value(forward.q_of_policy, settings.policy_critic)
         policy = actor_critic.policy_loss(improved, ln_q_pi, alpha)
         if settings.action_l2 > 0:
             policy = policy + settings.action_l2 * forward.action.square().mean()
-        total, named = critic + policy, {}
+        total, named = critic + policy if improves else critic, {}
         if forward.value is not None:
-            value_target = actor_critic.value_target(forward.q_of_policy, ln_q_pi, alpha)
+            which = batch.get("target_critics", slice(None))
+            value_target = actor_critic.value_target(forward.q_of_policy[which], ln_q_pi, alpha)
             value = actor_critic.value_loss(forward.value, value_target)
             total, named[names.VALUE_LOSS] = total + value, value.detach()
-        if isinstance(settings.alpha, LearnedAlpha):
+        if improves and isinstance(settings.alpha, LearnedAlpha):
             assert forward.log_density is not None
             assert forward.log_std is not None
             excess = self.excess_entropy(
@@ -182,6 +182,21 @@ class TACLoss:
             total = total + actor_critic.alpha_loss(self._module.log_alpha, excess)
         named |= {names.CRITIC_LOSS: critic.detach(), names.POLICY_LOSS: policy.detach()}
         return Losses(total, named, target)
+
+    def _critics(self, forward: TACForward, batch: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """The critics' targets [B], means of their atoms, and the critics' loss []."""
+        settings, value = self._settings, self.soft_value(forward.next)
+        reward, discount = batch[Columns.REWARDS], batch["discounts"]
+        if value.ndim == 2:
+            reward, discount = reward[:, None], discount[:, None]
+        target = actor_critic.critic_target(
+            reward, discount, value, settings.gamma, settings.target_bounds
+        )
+        weights, fractions = batch.get("weights"), self._module.quantile_fractions
+        if fractions is None:
+            return target, actor_critic.critic_loss(forward.q_values, target, weights)
+        loss = actor_critic.quantile_loss(forward.q_values, fractions, target, weights)
+        return target.mean(-1), loss
 
     def excess_entropy(self, log_density: Tensor, log_std: Tensor, ln_q_pi: Tensor) -> Tensor:
         """The policy's entropy minus a learned alpha's target, in the target's own measure.

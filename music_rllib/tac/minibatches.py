@@ -4,12 +4,13 @@ A call of K updates has K concatenated minibatches:
 
 - module `default_policy`: OBS [K*B, I], ACTIONS [K*B, A], REWARDS [K*B] of the task, "discounts"
   [K*B], NEXT_OBS [K*B, I], and "weights" [K*B] with prioritized replay. The Learner adds the
-  policy's "noise" [K*B, A], and "next_noise" with averaged critics.
+  policy's "noise" [K*B, A], "next_noise" with averaged critics, and "target_critics" [K*N] with
+  `target_critics`.
 - module `mi_estimator`, if it is trained: OBS [K*N, T, D] whole trajectories, and "inside" [K*N, T]
   if they have unequal lengths
 
-Shape legend: K updates, B transitions and N trajectories of one, T frames, I network inputs,
-D observation, A actions.
+Shape legend: K updates, B transitions and N trajectories (or critics of targets) of one, T frames,
+I network inputs, D observation, A actions.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The networks of TAC: perceptrons, twin critics as one batched network, observation normalizer.
 
-Shape legend: B batch, I input features, O outputs, C critics.
+Shape legend: B batch, I input features, O outputs, C critics, M quantiles.
 """
 
 from __future__ import annotations
@@ -81,15 +81,17 @@ def _relu(hidden: Tensor, layer_norm: bool) -> Tensor:
 class Critics(nn.Module):
     """C critics of equal shape, evaluated together: one batched matrix product per layer.
 
-    C is 2, or 1 for DDPG. All first layers read the same input, so they are a single product.
+    All first layers read the same input, so they are a single product. With `quantiles`, a critic
+    estimates M quantiles of the return instead of its mean.
     """
 
     def __init__(
-        self, inputs: int, hidden_sizes: Sequence[int], count: int = 2, *, layer_norm: bool = False
-    ) -> None:
+        self, inputs: int, hidden_sizes: Sequence[int], count: int = 2, *, layer_norm: bool = False,
+        quantiles: int = 0,
+    ) -> None:  # fmt: skip
         super().__init__()
-        self.count, self.layer_norm = count, layer_norm
-        sizes = [inputs, *hidden_sizes, 1]
+        self.count, self.layer_norm, self.quantiles = count, layer_norm, quantiles
+        sizes = [inputs, *hidden_sizes, quantiles or 1]
         self.weights = nn.ParameterList()
         self.biases = nn.ParameterList()
         for fan_in, fan_out in pairwise(sizes):
@@ -100,14 +102,15 @@ class Critics(nn.Module):
             self.biases.append(nn.Parameter(torch.empty(count, 1, fan_out).uniform_(-reach, reach)))
 
     def forward(self, inputs: Tensor, *, frozen: bool = False) -> Tensor:
-        """[B, I] -> [C, B].
+        """[B, I] -> [C, B], or [C, B, M] with quantiles.
 
         With `frozen`, gradients reach only the inputs: enough for the policy's step, with a third
         less work.
         """
         *hidden_layers, (weight, bias) = self._layers(frozen)
         hidden = self._hidden(inputs, hidden_layers)
-        return torch.baddbmm(bias, hidden, weight).squeeze(-1)
+        outputs = torch.baddbmm(bias, hidden, weight)
+        return outputs if self.quantiles else outputs.squeeze(-1)
 
     def _hidden(self, inputs: Tensor, layers: list[tuple[Tensor, Tensor]]) -> Tensor:
         """[B, I] -> [C, B, H]."""

@@ -1,6 +1,7 @@
 """RLModules: TAC's networks, MUSIC's estimator, and the weights of both as arrays.
 
-Shape legend: B batch, I network inputs, A action dimensions, C critics.
+Shape legend: B batch, I network inputs, A action dimensions, C critics, M quantiles of a critic,
+T atoms of a target.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from torch import Tensor, nn
 
 from music_rllib.config.tac_settings import LearnedAlpha, TACSettings
 from music_rllib.envs.values import observation_sizes
+from music_rllib.functional.actor_critic import smallest_atoms
 from music_rllib.functional.distribution import bounded_log_std, sample_squashed, squashed_action
 from music_rllib.intrinsic.estimator import MutualInformationEstimator
 from music_rllib.tac.networks import Critics, Floats, Perceptron, RunningNormaliser
@@ -37,7 +39,8 @@ class Bootstrap(NamedTuple):
     """Values of the next states by the target networks."""
 
     value: Tensor
-    """[B] V of the averaged value network, or the smallest averaged critic at the next action."""
+    """[B] V of the averaged value network, or the smallest averaged critic at the next action; with
+    quantiles [B, T] the smallest ones of all averaged critics."""
     log_density: Tensor | None = None
     """[B, A] of the next action, whose entropy is not in a critic's value; None if V includes it
     or the policy is deterministic."""
@@ -53,9 +56,9 @@ class TACForward(NamedTuple):
     log_std: Tensor | None
     """[B, A]; None for a deterministic policy."""
     q_values: Tensor
-    """[C, B] critics at the batch's actions."""
+    """[C, B] critics at the batch's actions, or [C, B, M] their quantiles."""
     q_of_policy: Tensor
-    """[C, B] critics with frozen weights at the policy's actions."""
+    """[C, B] critics with frozen weights at the policy's actions, means of quantiles."""
     value: Tensor | None
     """[B]; None without a value network."""
     next: Bootstrap
@@ -91,9 +94,11 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
         outputs = actions if self.deterministic else 2 * actions
         every = settings.layer_norm == "all"
         self.policy = Perceptron(inputs, sizes, outputs, layer_norm=every)
-        count = 1 if self.deterministic else 2
         of_critics = settings.layer_norm != "none"
-        self.critics = Critics(inputs + actions, sizes, count, layer_norm=of_critics)
+        self.critics = Critics(
+            inputs + actions, sizes, settings.critic_count, layer_norm=of_critics,
+            quantiles=settings.quantiles,
+        )  # fmt: skip
         if settings.bootstrap == "value":
             self.value = Perceptron(inputs, sizes, 1, layer_norm=every)
         self.normaliser: nn.Module = nn.Identity()
@@ -172,7 +177,7 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
                 log_density=log_density,
                 log_std=log_std,
                 q_values=self.critics(torch.cat([inputs, batch[Columns.ACTIONS]], -1)),
-                q_of_policy=self.critics(torch.cat([inputs, action], -1), frozen=True),
+                q_of_policy=mean_values(self.critics(torch.cat([inputs, action], -1), frozen=True)),
                 value=self.value(inputs).squeeze(-1) if self._has_value else None,
                 next=self.forward_target(batch),
             )
@@ -196,7 +201,23 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
             action, log_density = torch.tanh(self.policy_target(inputs)), None
         else:
             action, log_density, _ = self.sample_with_density(inputs, batch["next_noise"])
-        return Bootstrap(self.critics_target(torch.cat([inputs, action], -1)).amin(0), log_density)
+        outputs = self.critics_target(torch.cat([inputs, action], -1))
+        if (which := batch.get("target_critics")) is not None:
+            outputs = outputs[which]
+        if self.settings.quantiles:
+            values = smallest_atoms(outputs, self.settings.dropped_quantiles)
+        else:
+            values = outputs.amin(0)
+        return Bootstrap(values, log_density)
+
+    @property
+    def quantile_fractions(self) -> Tensor | None:
+        """[M] middles of M equal parts of [0, 1]; None if critics have no quantiles."""
+        count = self.settings.quantiles
+        if not count:
+            return None
+        like = self.critics.weights[0]
+        return (torch.arange(count, dtype=like.dtype, device=like.device) + 0.5) / count
 
     def make_target_networks(self) -> None:
         for name in self._averaged:
@@ -237,6 +258,11 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
         """Networks that acting does not need."""
         targets = [f"{name}_target" for name in self._averaged]
         return ["critics", "value", "log_alpha", *targets]
+
+
+def mean_values(outputs: Tensor) -> Tensor:
+    """[C, B] values of critics from their outputs, [C, B] or quantiles [C, B, M]."""
+    return outputs.mean(-1) if outputs.ndim == 3 else outputs
 
 
 class EstimatorModule(TorchRLModule, SelfSupervisedLossAPI):

@@ -201,6 +201,11 @@ CHANGES: dict[str, tuple[Any, dict[str, Any]]] = {
     "policy": ("deterministic", DDPG | {"policy": "stochastic"}),
     "bootstrap": ("critics", {}),
     "policy_critic": ("first", {}),
+    "critics": (3, {}),
+    "target_critics": (1, {}),
+    "quantiles": (5, {"bootstrap": "critics"}),
+    "dropped_quantiles": (1, {"bootstrap": "critics", "quantiles": 5}),
+    "policy_delay": (2, {}),
     "hidden_sizes": ((32, 16), {}),
     "layer_norm": ("critics", {}),
     "log_std_bounds": ((-1.0, -0.5), {}),
@@ -272,8 +277,20 @@ def test_no_setting_is_dead(setting: str, bases: dict[str, dict[str, float]]) ->
     assert last_weights({**base, setting: value}) != bases[repr(base)]
 
 
+REDQ: dict[str, Any] = {
+    "bootstrap": "critics",
+    "critics": 3,
+    "target_critics": 2,
+    "policy_critic": "mean",
+    "policy_delay": 3,
+    "quantiles": 5,
+}
+
+
 @pytest.mark.parametrize(
-    "settings", [DDPG, {"bootstrap": "critics"}, PER], ids=["ddpg", "sac", "per"]
+    "settings",
+    [DDPG, {"bootstrap": "critics"}, PER, REDQ],
+    ids=["ddpg", "sac", "per", "drawn quantile critics, delayed policy"],
 )
 def test_other_backbones_and_per_resume_exactly_too(
     settings: dict[str, Any], tmp_path: Path
