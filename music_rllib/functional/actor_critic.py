@@ -47,7 +47,7 @@ def critic_loss(q_values: Tensor, target: Tensor, weights: Tensor | None = None)
 def quantile_loss(
     quantiles: Tensor, fractions: Tensor, target: Tensor, weights: Tensor | None = None
 ) -> Tensor:
-    """Quantile Huber loss, summed over the critics (TQC, Kuznetsov et al. 2020, eq. 6 and 8).
+    """Quantile Huber loss, summed over the critics (TQC, Kuznetsov et al. 2020).
 
     Args:
         quantiles: [C, B, M] of the batch's actions.
@@ -63,7 +63,7 @@ def quantile_loss(
 
 
 def smallest_atoms(quantiles: Tensor, dropped: int) -> Tensor:
-    """[C, B, M] -> [B, C (M - dropped)] all critics' quantiles without the largest (TQC, eq. 7)."""
+    """[C, B, M] -> [B, C (M - dropped)] all critics' quantiles without the largest (TQC)."""
     count, _, size = quantiles.shape
     atoms = quantiles.transpose(0, 1).flatten(1).sort(-1).values
     return atoms[:, : count * (size - dropped)]

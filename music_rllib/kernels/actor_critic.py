@@ -68,7 +68,7 @@ def _squared_loss(outputs: Array, target: Array, weights: Array, gradient: Array
 def _quantile_loss(
     outputs: Array, target: Array, weights: Array, fractions: Array, gradient: Array
 ) -> float:
-    """Mean of w |f_m - [y < z_m]| huber(y - z_m) over B, M and T (TQC, eq. 6 and 8)."""
+    """Mean of w |f_m - [y < z_m]| huber(y - z_m) over B, M and T (TQC)."""
     count, rows, size = outputs.shape
     loss = 0.0
     for r in range(rows):
@@ -97,10 +97,20 @@ def _quantile_huber(quantile: float, target: Array, fraction: float) -> tuple[fl
 
 
 @compiled
-def smallest_atoms(outputs: Array, dropped: int) -> Array:
-    """[C, B, M] -> [B, C (M - dropped)] all quantiles of all critics without the largest ones.
+def target_atoms(outputs: Array, fractions: Any, dropped: int) -> Array:
+    """[C, B, M] -> [B, T] the value of the smallest critic, or the smallest quantiles of all."""
+    if fractions is None:
+        atoms: Array = smallest_critic(outputs[:, :, 0], np.arange(len(outputs))).reshape((-1, 1))
+    else:
+        atoms = smallest_atoms(outputs, dropped)
+    return atoms
 
-    TQC, eq. 7. NaN counts as the largest number, as in `torch.sort`.
+
+@compiled
+def smallest_atoms(outputs: Array, dropped: int) -> Array:
+    """[C, B, M] -> [B, C (M - dropped)] all quantiles of all critics without the largest (TQC).
+
+    NaN counts as the largest number, as in `torch.sort`.
     """
     count, rows, size = outputs.shape
     kept = count * (size - dropped)
@@ -118,6 +128,20 @@ def smallest_atoms(outputs: Array, dropped: int) -> Array:
         for t in range(kept):
             atoms[r, t] = pool[t]
     return atoms
+
+
+@compiled
+def mean_values(outputs: Array) -> Array:
+    """[C, R, M] -> [C, R]."""
+    count, rows, size = outputs.shape
+    means = np.empty((count, rows), outputs.dtype)
+    for c in range(count):
+        for r in range(rows):
+            total = outputs[c, r, 0]
+            for m in range(1, size):
+                total += outputs[c, r, m]
+            means[c, r] = total / size
+    return means
 
 
 @compiled

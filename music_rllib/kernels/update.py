@@ -19,12 +19,13 @@ from music_rllib.kernels import actor_critic, adam, blas, compiling, distributio
 from music_rllib.kernels.actor_critic import (
     critic_loss,
     critic_target,
+    mean_values,
     policy_loss,
     policy_loss_backward,
     policy_value,
     policy_value_backward,
-    smallest_atoms,
     smallest_critic,
+    target_atoms,
     value_loss,
 )
 from music_rllib.kernels.adam import AdamStep, adam_step
@@ -189,33 +190,6 @@ def _critic_outputs(critics: Network, which: Array, pairs: Array) -> Array:
 
 
 @compiled
-def _means(outputs: Array) -> Array:
-    """[C, R, M] -> [C, R]."""
-    count, rows, size = outputs.shape
-    means = np.empty((count, rows), outputs.dtype)
-    for c in range(count):
-        for r in range(rows):
-            total = outputs[c, r, 0]
-            for m in range(1, size):
-                total += outputs[c, r, m]
-            means[c, r] = total / size
-    return means
-
-
-@compiled
-def _pessimistic(outputs: Array, fractions: Any, dropped: int) -> Array:
-    """[N, B, M] outputs of critics -> [B, T] atoms of their pessimistic value.
-
-    The value of the smallest critic, or the smallest quantiles of all of them.
-    """
-    if fractions is None:
-        atoms: Array = smallest_critic(outputs[:, :, 0], np.arange(len(outputs))).reshape((-1, 1))
-    else:
-        atoms = smallest_atoms(outputs, dropped)
-    return atoms
-
-
-@compiled
 def _next_values(
     networks: Networks, batch: Batch, settings: UpdateSettings, following: Array,
     next_outputs: Array, q: float, alpha: float,
@@ -229,7 +203,7 @@ def _next_values(
     drawn = sample(next_outputs, batch.next_noise, settings.distribution)
     pairs = _pairs(following, drawn.action, drawn.action[:0])
     outputs = _critic_outputs(networks.critics_target, batch.target_critics, pairs)
-    values = _pessimistic(outputs, settings.fractions, settings.dropped_quantiles)
+    values = target_atoms(outputs, settings.fractions, settings.dropped_quantiles)
     ln_q_pi = ln_q_of_policy(drawn.log_density, q, settings.joint)[0]
     for r in range(len(ln_q_pi)):
         for t in range(values.shape[1]):
@@ -345,7 +319,7 @@ def _differentiate(
     pairs = _pairs(states[:rows], batch.actions, evaluated)
     count = len(networks.critics.weights)
     outputs = _critic_outputs(networks.critics, np.arange(count), pairs)
-    values, of_outputs = _means(outputs), np.empty_like(outputs[:, :rows])
+    values, of_outputs = mean_values(outputs), np.empty_like(outputs[:, :rows])
     asked, losses, fractions = values[:, rows:], learned.losses[k], settings.fractions
     losses[0] = critic_loss(outputs[:, :rows], target, batch.weights, fractions, of_outputs)
     of_values = np.empty((count, rows if improves else 0), values.dtype)
@@ -363,16 +337,14 @@ def _differentiate(
         smallest = smallest_critic(asked, batch.target_critics)
         losses[2] = value_loss(of_states, smallest, ln_q_pi, alpha, gradient)
         backward(networks.value, states[:rows], np.arange(rows), gradient, rows, networks.scratch)
+    targets = mean_values(target.reshape((1, rows, -1)))
     for r in range(rows):  # assigning whole slices takes seconds to compile
         for c in range(len(values)):
             learned.q_values[k, c, r] = values[c, r]
         for a in range(drawn.log_density.shape[1]):
             learned.log_density[k, r, a] = drawn.log_density[r, a]
             learned.log_std[k, r, a] = drawn.log_std[r, a]
-        total = target[r, 0]
-        for t in range(1, target.shape[1]):
-            total += target[r, t]
-        learned.target[k, r] = total / target.shape[1]
+        learned.target[k, r] = targets[0, r]
         learned.ln_q_pi[k, r] = ln_q_pi[r]
 
 

@@ -373,6 +373,18 @@ BAD: list[tuple[Document, str]] = [
         "stages.pretrain.tac.log_std_bounds must be increasing, got 1, 0",
     ),
     (
+        with_stage(0, tac={"target_critics": 3}),
+        "stages.pretrain.tac.target_critics must be <= critics (2), got 3",
+    ),
+    (
+        with_stage(0, tac={"quantiles": 5}),
+        "stages.pretrain.tac: bootstrap must be 'critics' with quantiles",
+    ),
+    (
+        with_stage(0, tac={"bootstrap": "critics", "quantiles": 5, "dropped_quantiles": 5}),
+        "stages.pretrain.tac.dropped_quantiles must be < quantiles (5), got 5",
+    ),
+    (
         with_stage(
             0, tac={"entropic_index": {"follows": "success_rate", "points": [[0, 0], [1, 1]]}}
         ),
