@@ -56,21 +56,6 @@ class FinalScores:
         return len(self.scores)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class FinalDifference:
-    """Difference of the final scores of two conditions, without a test."""
-
-    first: FinalScores
-    second: FinalScores
-    improvement: float
-    """Probability that a run of `first` ends higher than a run of `second`; ties count half."""
-
-    @property
-    def gap(self) -> Estimate:
-        """Mean of `first` minus mean of `second`."""
-        return st.difference(self.first.estimate, self.second.estimate)
-
-
 @dataclass(frozen=True, kw_only=True)
 class Scope:
     """Conditions on one task, or on all tasks together."""
@@ -86,12 +71,9 @@ class Scope:
     """Scores of the conditions that may be compared: in a search, those on fresh seeds."""
 
     @property
-    def differences(self) -> tuple[FinalDifference, ...]:
-        """A difference for each pair of `compared`, the later condition minus the earlier one."""
-        return tuple(
-            FinalDifference(first=a, second=b, improvement=st.improvement(a.scores, b.scores))
-            for b, a in combinations(self.compared, 2)
-        )
+    def pairs(self) -> tuple[tuple[FinalScores, FinalScores], ...]:
+        """Each pair of `compared`, the later condition first."""
+        return tuple((second, first) for first, second in combinations(self.compared, 2))
 
 
 @dataclass(frozen=True, kw_only=True)

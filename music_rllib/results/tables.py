@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from music_rllib import names
+from music_rllib.results import statistics as st
 from music_rllib.results.analysis import StageAnalysis
 from music_rllib.results.answer import (
     interval_in_words,
@@ -290,12 +291,12 @@ def performance_tables(analyses: Sequence[StageAnalysis]) -> list[Table]:
                 (
                     analysis.stage.name,
                     scope.name,
-                    f"{pair.first.condition.label} against {pair.second.condition.label}",
-                    pair.gap,
-                    Share(pair.improvement),
+                    f"{first.condition.label} against {second.condition.label}",
+                    st.difference(first.estimate, second.estimate),
+                    Share(st.improvement(first.scores, second.scores)),
                 )
                 for analysis, scope in scopes
-                for pair in scope.differences
+                for first, second in scope.pairs
             ],
             note="Difference of the means, without a test. "
             "Probability of improvement: a run of the first condition ends higher than a run of "
