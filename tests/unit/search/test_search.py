@@ -18,9 +18,9 @@ from music_rllib import names
 from music_rllib.config.load import load_config, warnings_of
 from music_rllib.config.problems import ConfigError
 from music_rllib.config.search import Objective, Pruning, Rung, SearchSettings
-from music_rllib.search.new_study import fits
 from music_rllib.search.objective import aggregate, reason_to_prune, score
 from music_rllib.search.sampler import VALUES, Proposer, trial_at
+from music_rllib.search.study import fits
 from music_rllib.store.history import Report
 from tests.played_search import Document, document
 
