@@ -29,6 +29,7 @@ from music_rllib.store.lease import process_start, this_machine
 from music_rllib.store.storage import StorageError, is_remote
 from music_rllib.store.work_folder import steps_of
 from music_rllib.sweep.views.budget import searched_runs
+from music_rllib.sweep.views.results import shown_metric
 
 LOCAL_SECONDS, REMOTE_SECONDS = 2.0, 15.0
 """Seconds between two writes of `state.json`, in a folder and in a bucket."""
@@ -171,14 +172,15 @@ class StateFile(Listener):
             if status in (Status.WAITING, Status.STARTED, Status.PAUSED):
                 steps_left += node.run.env_steps - steps
             if status is Status.STARTED:
-                metric = node.run.task.primary_metric
+                metrics = reached.metrics if reached else {}
+                metric = shown_metric(node.run, metrics)
                 running.append(
                     {
                         "run": node.label,
                         "env_steps": steps,
                         "budget": node.run.env_steps,
                         "metric": metric,
-                        "value": reached.metrics.get(metric) if reached else None,
+                        "value": metrics.get(metric),
                     }
                 )
         trials = Counter(stage for stage, _ in {(run.stage, run.trial) for run in sweep.plan.runs})

@@ -37,12 +37,12 @@ def results_table(
         results: Node key to the result, or to the progress of an unfinished run.
     """
     metrics = _metric_columns({node.run.task.primary_metric for node in plan.nodes})
-    moving = {
-        node.key
+    shown = {
+        node.key: shown_metric(node.run, results[node.key].metrics)
         for node in plan.nodes
-        if node.key in results and _moves_objects(node.run, results[node.key].metrics)
+        if node.key in results
     }
-    if moving:
+    if names.EVAL_DISPLACEMENT in shown.values():
         metrics |= {names.EVAL_DISPLACEMENT: "object\nmoved"}
     if any(names.SHANNON_ENTROPY in result.metrics for result in results.values()):
         metrics |= {names.SHANNON_ENTROPY: "entropy,\nnats"}
@@ -55,9 +55,13 @@ def results_table(
         result, state = results.get(run.key), status(run.key)
         cells = ["-"] * (len(metrics) + 2)
         if result is not None:
-            hidden = names.EVAL_RATES if run.key in moving else ()
-            shown = (result.metrics.get(m) if m not in hidden else None for m in metrics)
-            cells = [*map(measured, metrics, shown), f"{result.env_steps:,}", clock(result.seconds)]
+            hidden = names.EVAL_RATES if shown[run.key] == names.EVAL_DISPLACEMENT else ()
+            values = (None if name in hidden else result.metrics.get(name) for name in metrics)
+            cells = [
+                *map(measured, metrics, values),
+                f"{result.env_steps:,}",
+                clock(result.seconds),
+            ]
         name = _STATES.get(state, str(state))
         table.add_row(label(run.label), *cells, name, style=_STYLES.get(state))
     return table
@@ -102,17 +106,17 @@ def measured(metric: str, value: float | None) -> str:
 
 def evaluation_text(run: RunSettings, metrics: Mapping[str, float], *, any_step: bool) -> str:
     """A run's last evaluation: `success 35 % (any step 40 %)`, `return -5.2` or `moved 0.12 m`."""
-    moves = _moves_objects(run, metrics)
-    metric = names.EVAL_DISPLACEMENT if moves else run.task.primary_metric
+    metric = shown_metric(run, metrics)
     text = f"{names.word_of(metric)} {measured(metric, metrics.get(metric))}"
     if metric != names.EVAL_SUCCESS or not any_step:
         return text
     return f"{text} (any step {percent(metrics.get(names.EVAL_SUCCESS_ANY))})"
 
 
-def _moves_objects(run: RunSettings, metrics: Mapping[str, float]) -> bool:
-    """Whether a run is shown by how far it moves objects: without a reward, success is chance."""
-    return not run.music.task_reward and names.EVAL_DISPLACEMENT in metrics
+def shown_metric(run: RunSettings, metrics: Mapping[str, float]) -> str:
+    """The task's primary metric; without the task's reward, how far the run moves objects."""
+    by_chance = not run.music.task_reward and names.EVAL_DISPLACEMENT in metrics
+    return names.EVAL_DISPLACEMENT if by_chance else run.task.primary_metric
 
 
 _STATUSES = (
