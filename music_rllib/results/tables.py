@@ -242,8 +242,12 @@ def study_tables(study: Study) -> list[Table]:
 
 
 def performance_tables(analyses: Sequence[StageAnalysis]) -> list[Table]:
-    """Final values, entropies, times to a threshold and differences of all stages."""
-    scopes = [(one, scope) for one in analyses for scope in one.scopes]
+    """Final values, entropies, times to a threshold and differences of all stages.
+
+    Success is not listed for stages that train without the task's reward, beside others.
+    """
+    rewarded = [one for one in analyses if one.stage.has_task_reward] or analyses
+    scopes = [(one, scope) for one in rewarded for scope in one.scopes]
     return [
         Table(
             name="final",
@@ -282,7 +286,7 @@ def performance_tables(analyses: Sequence[StageAnalysis]) -> list[Table]:
             "it and not because of q. S_q is computed with each run's own q: its values at "
             "different q are not comparable.",
         ),
-        _thresholds(analyses),
+        _thresholds(rewarded),
         Table(
             name="differences",
             title="Differences of the final values",

@@ -562,10 +562,12 @@ def test_stages_that_train_for_the_task_share_a_figure() -> None:
         assert SIDE_BY_SIDE not in {drawing.stage for drawing in build_report(one).drawings}
 
 
-def test_success_by_chance_is_drawn_only_if_no_stage_trains_for_the_task() -> None:
+def test_success_by_chance_is_shown_only_if_no_stage_trains_for_the_task() -> None:
     def drawn(*stages: str) -> set[str]:
         report = build_report(of_stages(*stages))
-        return {one.stage for one in report.drawings if one.metric is not None}
+        found = {one.stage for one in report.drawings if one.metric is not None}
+        assert {row[0] for row in performance_tables(report.analyses)[0].rows} == found
+        return found
 
     assert drawn("pretrain", "plain") == {"plain"}
     assert drawn("pretrain") == {"pretrain"}
