@@ -31,6 +31,7 @@ from music_rllib.results.answer import answer
 from music_rllib.results.conditions import SIDE_BY_SIDE, find_stages
 from music_rllib.results.data import Points, RunRecord, Sweep, columns
 from music_rllib.results.study import study_of
+from music_rllib.results.tables import performance_tables
 
 STEPS = range(20_000, 200_001, 20_000)
 
