@@ -37,6 +37,7 @@ CONTENTS = """
 :caption: Use
 configuration
 add_an_environment
+intrinsic_rewards
 comparing_q
 searching
 reports

@@ -57,7 +57,7 @@ from music_rllib.config.tac_settings import (
     TACSettings,
 )
 from music_rllib.envs.tasks import BUILT_IN_TASKS, Task
-from music_rllib.intrinsic.settings import MusicSettings
+from music_rllib.intrinsic.settings import IntrinsicSettings, MusicSettings
 from music_rllib.schedules import Linear, Measured, Piecewise
 
 TARGET = Path(__file__).with_name("configuration.md")
@@ -124,8 +124,9 @@ VARIANTS_TEXT = """\
 ## Variants
 
 `variant` fixes some settings of `music`; other values are errors. The networks that it takes over
-come from the run that `init_from` names. The default of `music.mi_reward_weight` is 1 for MUSIC-u
-and the task's `mi_reward_weight` for MUSIC-r.
+come from the run that `init_from` names. `intrinsic-u` and `intrinsic-r` are the counterparts of
+MUSIC-u and MUSIC-r for `intrinsic.reward`, which every other variant can have too. The default of
+`music.mi_reward_weight` is 1 for MUSIC-u and the task's `mi_reward_weight` for MUSIC-r.
 """
 
 SCHEDULES_TEXT = """\
@@ -206,6 +207,8 @@ def document() -> str:
         table(rows(ColoredNoise, "tac.behaviour.")),
         "### music",
         table(rows(MusicSettings, "music.")),
+        "### intrinsic",
+        table(rows(IntrinsicSettings, "intrinsic.")),
         "### replay",
         table(rows(ReplaySettings, "replay.")),
         SCHEDULES_TEXT,
@@ -249,6 +252,7 @@ def variants() -> str:
         "scratch": "nothing",
         "estimator": "the estimator",
         "agent": "policy, critics, value, their averages, and the observation normaliser",
+        "intrinsic": "the networks and the scale of the intrinsic reward",
     }
     lines = ["| variant | fixes | takes over |", "|---|---|---|"]
     for name, rules in VARIANTS.items():

@@ -61,10 +61,18 @@ MI_BOUND = "mutual_information/bound"
 MI_REWARD = "mutual_information/reward"
 """Mean intrinsic reward of the sampled transitions, before its weight."""
 
+# Other intrinsic rewards ------------------------------------------------------------------------
+INTRINSIC_REWARD = "intrinsic/reward"
+"""Mean reward of the sampled transitions, in [-1, 0], before its weight."""
+INTRINSIC_BONUS = "intrinsic/bonus"
+"""Mean bonus of the sampled transitions, before it is scaled."""
+
 # Learning: means over the updates since the last report ------------------------------------------
 CRITIC_LOSS = "loss/critics"
 VALUE_LOSS = "loss/value"
 POLICY_LOSS = "loss/policy"
+INTRINSIC_LOSS = "loss/intrinsic"
+"""Loss of the networks of an intrinsic reward other than MUSIC's."""
 Q_MEAN = "critics/mean"
 """Mean of Q1 and Q2 over the sampled transitions."""
 ENTROPY = "entropy/tsallis"
@@ -80,11 +88,14 @@ LOG_STD_AT_BOUND = "bounds/log_std_share"
 ENTROPIC_INDEX = "schedule/entropic_index"
 ALPHA = "schedule/alpha"
 MI_REWARD_WEIGHT = "schedule/mi_reward_weight"
+INTRINSIC_WEIGHT = "schedule/intrinsic_weight"
 ENTROPIC_INDEX_FOLLOWS = "schedule/entropic_index_follows"
 MI_REWARD_WEIGHT_FOLLOWS = "schedule/mi_reward_weight_follows"
+INTRINSIC_WEIGHT_FOLLOWS = "schedule/intrinsic_weight_follows"
 FOLLOWED = {
     ENTROPIC_INDEX: ENTROPIC_INDEX_FOLLOWS,
     MI_REWARD_WEIGHT: MI_REWARD_WEIGHT_FOLLOWS,
+    INTRINSIC_WEIGHT: INTRINSIC_WEIGHT_FOLLOWS,
 }
 """A setting's metric to the metric of the quantity that it follows: a success rate, or an entropy
 in nats, smoothed and monotone as configured."""
@@ -102,7 +113,9 @@ SHANNON_OF_DIMENSION = "entropy/shannon_dimension_"
 ENTROPY_OF_DIMENSION = "entropy/tsallis_dimension_"
 """Prefix; with an action dimension: the dimension's S_q."""
 
-LEARNER_GROUPS = ("bounds/", "critics/", "entropy/", "loss/", "mutual_information/", "schedule/")
+LEARNER_GROUPS = (
+    "bounds/", "critics/", "entropy/", "intrinsic/", "loss/", "mutual_information/", "schedule/",
+)  # fmt: skip
 """Beginnings of the names of the Learner's metrics."""
 
 # Measured in the worker, logged with the other metrics ------------------------------------------
@@ -117,7 +130,7 @@ SETTING_ALPHA = "setting/alpha"
 SETTING_MI_REWARD_WEIGHT = "setting/mi_reward_weight"
 
 GROUPS = (
-    "bounds", "critics", "entropy", "evaluation", "loss",
+    "bounds", "critics", "entropy", "evaluation", "intrinsic", "loss",
     "mutual_information", "schedule", "setting", "system", "training",
 )  # fmt: skip
 """Groups of the metrics above."""

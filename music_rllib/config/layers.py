@@ -17,6 +17,7 @@ from music_rllib.config.run_settings import (
     VARIANTS,
     RunSettings,
     Variant,
+    variant_intrinsic,
     variant_music,
     without_retired,
 )
@@ -135,6 +136,8 @@ def merge(
     idle = f"has no effect with variant {variant}"
     for field, value in variant_music(variant, task).items():
         layers.put(("music", field), value, ("music", field))
+    for field, value in variant_intrinsic(variant).items():
+        layers.put(("intrinsic", field), value, ("intrinsic", field))
     task_path = (*stage_path, "per_task", task.name)
     own = stage["per_task"].get(task.name) or {}
     for place, settings in ((("defaults",), defaults), (stage_path, stage), (task_path, own)):

@@ -14,13 +14,16 @@ from pydantic import BaseModel, Field, model_validator
 
 from music_rllib.config.tac_settings import TACSettings
 from music_rllib.envs.tasks import Task
-from music_rllib.intrinsic.settings import MusicSettings
+from music_rllib.intrinsic.settings import IntrinsicSettings, MusicSettings
 from music_rllib.schedules import Schedule, StrictModel, bounded, check_measurable
 from music_rllib.store.handoff import Architecture, HandoffInfo, Spaces
 
-Variant = Literal["tac", "music-u", "music-r", "music-f", "music-p"]
-StartsFrom = Literal["scratch", "estimator", "agent"]
-"""Source of a variant's network weights: nothing, a trained estimator, or a trained agent."""
+Variant = Literal[
+    "tac", "music-u", "music-r", "music-f", "music-p", "intrinsic-u", "intrinsic-r"
+]  # fmt: skip
+StartsFrom = Literal["scratch", "estimator", "agent", "intrinsic"]
+"""Source of a variant's network weights: nothing, a trained estimator, a trained agent, or the
+networks of an intrinsic reward."""
 
 
 class VariantRules(NamedTuple):
@@ -83,6 +86,15 @@ VARIANTS: Mapping[Variant, VariantRules] = MappingProxyType(
             | {"replay.priority_exponent", "replay.importance_exponent"},
             starts_from="estimator",
         ),
+        "intrinsic-u": VariantRules(
+            fixed=_fixed("none", task_reward=False),
+            without_effect=_OTHER_MUSIC | _N_STEPS,
+        ),
+        "intrinsic-r": VariantRules(
+            fixed=_fixed("none", task_reward=True),
+            without_effect=_OTHER_MUSIC | _N_STEPS | {"intrinsic.lr"},
+            starts_from="intrinsic",
+        ),
     }
 )
 
@@ -97,12 +109,18 @@ def variant_music(variant: Variant, task: Task) -> dict[str, Any]:
     return music
 
 
+def variant_intrinsic(variant: Variant) -> dict[str, Any]:
+    """Fields of `IntrinsicSettings` that the variant sets, below all other layers."""
+    frozen = {"frozen": VARIANTS[variant].starts_from == "intrinsic"}
+    return frozen | ({"weight": 1.0} if variant == "intrinsic-u" else {})
+
+
 def contradiction(variant: Variant, fixed: Any, got: Any) -> str:
     """The rule that a setting breaks that contradicts its variant."""
     return f"must be {json.dumps(fixed)} for {variant}, got {json.dumps(got)}"
 
 
-SECTIONS = ("evaluation", "tac", "music", "replay")
+SECTIONS = ("evaluation", "tac", "music", "intrinsic", "replay")
 """Groups of settings, whose fields layers replace one by one."""
 LAYER_KEYS = ("env_steps", "num_envs", *SECTIONS)
 """Keys that `defaults`, a stage, its `per_task` and a grid point can set."""
@@ -161,9 +179,9 @@ class ReplaySettings(StrictModel):
     importance_exponent: Annotated[Schedule, bounded("in [0, 1]", lambda b: 0 <= b <= 1)] = 0.4
     """PER: strength of the importance weights that correct its bias (beta; 1 corrects it fully)."""
 
-    def problem(self, music: MusicSettings) -> str | None:
-        """The rule that these settings break with those of the intrinsic reward."""
-        if self.n_steps > 1 and music.estimator != "none":
+    def problem(self, music: MusicSettings, intrinsic: IntrinsicSettings) -> str | None:
+        """The rule that these settings break with those of intrinsic rewards."""
+        if self.n_steps > 1 and (music.estimator != "none" or intrinsic.reward is not None):
             got = self.n_steps
             return f"n_steps must be 1 with an intrinsic reward, which is of one step, got {got}"
         for name, kept in (("priority", "uniform"), ("hindsight_episodes", "all")):
@@ -209,6 +227,7 @@ class RunSettings(StrictModel):
     evaluation: Evaluation = Evaluation()
     tac: TACSettings = TACSettings()
     music: MusicSettings = MusicSettings()
+    intrinsic: IntrinsicSettings = IntrinsicSettings()
     replay: ReplaySettings = ReplaySettings()
 
     @property
@@ -225,7 +244,19 @@ class RunSettings(StrictModel):
             estimator_hidden_size=self.music.hidden_size,
             log_std_form=self.tac.log_std_form,
             log_std_bounds=self.tac.log_std_bounds if self.tac.log_std_form == "tanh" else None,
+            intrinsic=self.intrinsic.reward and self.intrinsic.identity,
         )
+
+    @property
+    def code(self) -> str:
+        """Name of the user's code that it depends on: its task, and a reward of the user's own."""
+        return " with ".join((self.task.name, *self.own_modules))
+
+    @property
+    def own_modules(self) -> tuple[str, ...]:
+        """The user's modules that it imports, except the environment's."""
+        own = self.intrinsic.own_module
+        return () if own is None else (own,)
 
     def handoff_info(self, node_key: str, env_steps: int, spaces: Spaces) -> HandoffInfo:
         """Describe a handoff of this run after `env_steps`."""
@@ -244,14 +275,17 @@ class RunSettings(StrictModel):
     def identity(self) -> dict[str, Any]:
         """Everything that determines the numbers, as plain data.
 
-        Settings of `YOUNGER` are omitted if they have their default: runs that do not use them keep
-        the identity that they had before. Removed settings keep their last value.
+        Settings of `YOUNGER` are omitted if they have their default, and `intrinsic` without a
+        reward: runs that do not use them keep the identity that they had before. Removed settings
+        keep their last value.
         """
         settings = self.model_dump(mode="json") | {"task": self.task.identity()}
         if self.replay.hindsight_episodes == "moved" and self.task.moved_distance is not None:
             settings["task"]["moved_distance"] = self.task.moved_distance
         for (section, name), kept in RETIRED.items():
             settings[section][name] = kept
+        if self.intrinsic.reward is None:
+            del settings["intrinsic"]
         for section, name in YOUNGER:
             part: BaseModel = getattr(self, section)
             default = type(part).model_fields[name].get_default(call_default_factory=True)
@@ -266,6 +300,12 @@ class RunSettings(StrictModel):
             if getattr(self.music, field) != value:
                 rule = contradiction(self.variant, value, getattr(self.music, field))
                 raise ValueError(f"music.{field} {rule}")
+        self.music.check_has_reward(self.intrinsic)
+        if self.variant.startswith("intrinsic-") and self.intrinsic.reward is None:
+            raise ValueError(f"intrinsic.reward must be given for {self.variant}, got null")
+        if self.intrinsic.frozen != (frozen := variant_intrinsic(self.variant)["frozen"]):
+            rule = contradiction(self.variant, frozen, self.intrinsic.frozen)
+            raise ValueError(f"intrinsic.frozen {rule}")
         if rules.uses_mi and not self.task.has_split:
             raise ValueError(
                 f"task must have agent_indices and surrounding_indices for {self.variant}, "
@@ -278,6 +318,7 @@ class RunSettings(StrictModel):
         adaptive = {
             "tac.entropic_index": self.tac.entropic_index,
             "music.mi_reward_weight": self.music.mi_reward_weight,
+            "intrinsic.weight": self.intrinsic.weight,
         }
         success, entropy = self.task.success_key is not None, self.tac.policy == "stochastic"
         check_measurable(adaptive, success=success, entropy=entropy)
@@ -285,7 +326,7 @@ class RunSettings(StrictModel):
 
     @model_validator(mode="after")
     def _intrinsic_reward_fits_the_replay(self) -> Self:
-        if problem := self.replay.problem(self.music):
+        if problem := self.replay.problem(self.music, self.intrinsic):
             raise ValueError(f"replay.{problem}")
         return self
 
@@ -313,6 +354,8 @@ def handed_over(run: RunSettings) -> tuple[str, ...]:
             return ()
         case "estimator":
             return ("mi_estimator",)
+        case "intrinsic":
+            return ("intrinsic",)
     modules = ["policy", "critics"]
     modules += ["value", "value_target"] if run.tac.bootstrap == "value" else ["critics_target"]
     if run.tac.policy == "deterministic":

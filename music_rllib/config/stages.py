@@ -284,6 +284,12 @@ def _check_stage(stage: Stage, task: Task | None, above: Stage, findings: Findin
         rule = f"must be a stage with an estimator, got {above.name!r}, which is {above.variant}"
         findings.add((), rule)
         return
+    networks = VARIANTS[stage.variant].starts_from == "intrinsic"
+    without = [run for at in above.points for run in at.runs.values() if not run.intrinsic.reward]
+    if networks and without:
+        rule = f"must be a stage with intrinsic.reward, got {above.name!r}, which has none"
+        findings.add((), rule)
+        return
     known = sorted({task.name for task in above.tasks})
     for own in stage.tasks:
         wanted = task or own

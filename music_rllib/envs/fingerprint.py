@@ -6,8 +6,9 @@ depend on its code, so a run keeps a *fingerprint*, from name to version or cont
     {"package gymnasium": "1.2.3", "source lab_env.py": "5b0c…", "file assets/arm.xml": "91d4…"}
 
 - **Sources**: the module in front of the id, the modules of its entry point, of its classes and of
-  the wrappers of its registration, and all modules that these import. Modules that belong to Python
-  or are installed do not count (an editable installation counts as source).
+  the wrappers of its registration, the module of a user's own intrinsic reward, and all modules
+  that these import. Modules that belong to Python or are installed do not count (an editable
+  installation counts as source).
 - **Files** in the folder of these modules, or of their package, and below: models (`MODELS`), and
   every other file whose name appears in the sources or in a model; also files that `env_kwargs`
   name.
@@ -29,7 +30,7 @@ import json
 import os
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -56,8 +57,12 @@ _WITHOUT_EFFECT = frozenset(
 _PACKAGE, _SOURCE, _FILE = "package ", "source ", "file "
 
 
-def fingerprint_of(env_id: str, env_kwargs: Mapping[str, Any]) -> Fingerprint:
+def fingerprint_of(
+    env_id: str, env_kwargs: Mapping[str, Any], modules: Sequence[str] = ()
+) -> Fingerprint:
     """The fingerprint of an environment; imports its module, but does not make the environment.
+
+    `modules` are imported too, and their sources, files and packages are added.
 
     Raises:
         ImportError: A module is not found.
@@ -65,13 +70,24 @@ def fingerprint_of(env_id: str, env_kwargs: Mapping[str, Any]) -> Fingerprint:
     """
     if env_id in {task.env_id for task in BUILT_IN_TASKS.values()}:
         found = {_PACKAGE + name: _version(name) for name in ("gymnasium-robotics", "mujoco")}
+        found |= _fingerprint_of_modules(map(_imported, modules)) if modules else {}
         return found | _files_of_arguments(env_kwargs)
     register_robotics()
-    walk = _Walk()
-    for module in _modules_of(env_id):
-        walk.visit(module, is_root=True)
-    found = walk.packages | walk.sources | walk.files()
+    found = _fingerprint_of_modules([*_modules_of(env_id), *map(_imported, modules)])
     return dict(sorted((found | _files_of_arguments(env_kwargs)).items()))
+
+
+def _fingerprint_of_modules(modules: Iterable[str]) -> dict[str, str]:
+    walk = _Walk()
+    for module in modules:
+        walk.visit(module, is_root=True)
+    return walk.packages | walk.sources | walk.files()
+
+
+def _imported(module: str) -> str:
+    make_importable(module)
+    importlib.import_module(module)
+    return module
 
 
 def digest_of(fingerprint: Fingerprint) -> str:
@@ -110,9 +126,7 @@ def _modules_of(env_id: str) -> Iterator[str]:
     """Names of the modules that register the environment, define its classes and wrap it."""
     module = env_id.rpartition(":")[0]
     if module:
-        make_importable(module)
-        importlib.import_module(module)
-        yield module
+        yield _imported(module)
     with warnings.catch_warnings():  # `gymnasium.make` prints the warning about an old version
         warnings.simplefilter("ignore")
         spec = gym.envs.registration._find_spec(env_id)

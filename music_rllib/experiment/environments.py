@@ -33,6 +33,7 @@ class FoundRun:
     key: str
     label: str
     task: str
+    """Its task, with the module of its intrinsic reward if that is the user's own."""
     continuation: str | None
     """Key of the last checkpoint that it shares with runs of other budgets."""
     progress: str = ""
@@ -48,7 +49,7 @@ def found_runs(sweep: OpenSweep) -> list[FoundRun]:
         FoundRun(
             key=node.key,
             label=node.label,
-            task=node.run.task.name,
+            task=node.run.code,
             continuation=continuation_key(node.run, node.source_key),
         )
         for node in sweep.plan.nodes
@@ -57,7 +58,7 @@ def found_runs(sweep: OpenSweep) -> list[FoundRun]:
         FoundRun(
             key=node["key"],
             label=node["label"],
-            task=node["label"].split("/")[1],
+            task=node.get("code", node["label"].split("/")[1]),
             continuation=node.get("continuation"),
         )
         for node in (sweep.recorded.get("nodes", ()) if sweep.plan.searched else ())

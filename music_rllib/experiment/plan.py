@@ -302,7 +302,7 @@ def budget_settings(run: RunSettings) -> list[str]:
     """Dotted settings whose value at a step depends on the budget: linear schedules."""
     return [
         f"{section}.{name}"
-        for section in ("tac", "music", "replay")
+        for section in ("tac", "music", "intrinsic", "replay")
         for name, value in getattr(run, section)
         if any(isinstance(inner, Linear) for inner in _values(value))
     ]

@@ -79,6 +79,7 @@ def plan_document(sweep: OpenSweep) -> dict[str, Any]:
             "input": node.source_key,
             "env_steps": node.run.env_steps,
             "continuation": continuation_key(node.run, node.source_key),
+            **({"code": node.run.code} if node.run.own_modules else {}),
         }
         for node in sweep.plan.nodes
     ]

@@ -1,93 +1,165 @@
-"""The interface between the Learner and an intrinsic reward.
+"""The interface of an intrinsic reward: subclass `IntrinsicReward`, and name the class in YAML.
 
-Shape legend: K updates of a call, B transitions and N trajectories of one, T frames, D observation.
+Shape legend: B transitions, N trajectories, T frames, D observation, G goal, A action, n steps.
 """
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
-from typing import Any, Protocol
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import ClassVar, NamedTuple
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
-from torch import Tensor
-
-from music_rllib.kernels.adam import FusedAdam
-from music_rllib.replay.trajectories import Trajectory
+from torch import Tensor, nn
 
 
-class IntrinsicReward(Protocol):
-    """Relabels minibatches, learns from trajectories, and measures fresh episodes.
+class Sizes(NamedTuple):
+    """Sizes of an environment's spaces, and its split into agent and surrounding state."""
 
-    Its networks belong to a module of the Learner. All random numbers come from the generator that
-    is passed in, so that a resumed run draws the same ones.
+    observation: int
+    goal: int
+    """0 without goals."""
+    action: int
+    agent_indices: tuple[int, ...] = ()
+    surrounding_indices: tuple[int, ...] = ()
+    """Positions in the observation; empty if the task has no split."""
+
+
+class Batch(NamedTuple):
+    """Transitions of one minibatch, and what the reward's class asks for."""
+
+    states: Tensor
+    """[B, D] observations."""
+    actions: Tensor
+    """[B, A] in [-1, 1]."""
+    followers: Tensor
+    """[B, D] next observations."""
+    goals: Tensor
+    """[B, G] desired goals, some of them relabeled by hindsight."""
+    generator: torch.Generator
+    """The source of all random numbers, so that a resumed run draws the same ones."""
+    stored: Tensor | None = None
+    """[B] results of `of_episode`, with `by_episode`."""
+    trajectories: Tensor | None = None
+    """[N, T, D] observations of whole trajectories, with `trajectories`."""
+    inside: Tensor | None = None
+    """[N, T] False for padding at a trajectory's end; None: no padding."""
+
+
+class IntrinsicReward(nn.Module):
+    """A bonus for transitions, and the loss of its networks.
+
+    Only `bonus` must be written. Parameters and buffers are saved in checkpoints, and handed over
+    to variant `intrinsic-r`. Keep everything that changes in them, and take random numbers from
+    `Batch.generator`.
+
+    Args:
+        sizes: sizes of the environment's spaces.
+        **settings: a subclass has keyword arguments; they are `intrinsic.settings` in YAML.
+
+    Raises:
+        ValueError: The environment lacks something that the reward needs.
     """
 
-    @property
-    def is_on(self) -> bool:
-        """Whether there is a reward; without one, `draw` and `total` may still be called."""
+    scale: ClassVar[float | None] = None
+    """Bonus that earns the largest reward. None: twice the root mean square of all bonuses so far.
+    """
+    smallest_scale: ClassVar[float] = 0.0
+    """Lower limit of that scale, so that noise earns nothing if there is nothing else."""
+    by_episode: ClassVar[bool] = False
+    """Whether bonuses depend on the earlier steps of an episode; see `of_episode`."""
+    trajectories: ClassVar[int] = 0
+    """Number of whole trajectories that the loss of each update needs."""
+    sums: Tensor
+    """[2] number of bonuses so far, and the sum of their squares."""
 
-    @property
-    def learning_rate(self) -> float | None:
-        """Learning rate of its networks; None if they are not trained."""
+    def __init__(self, sizes: Sizes) -> None:
+        super().__init__()
+        self.sizes = sizes
+        self.register_buffer("sums", torch.zeros(2, dtype=torch.float64))
 
-    def draw(
-        self, updates: int, transitions: int, trajectories: dict[str, Tensor] | None,
-        generator: torch.Generator, *, first: bool,
-    ) -> Sequence[Hashable]:  # fmt: skip
-        """Draw the random numbers of K updates, one value each, for `reward`.
+    def bonus(self, batch: Batch) -> Tensor:
+        """[B] bonuses >= 0, of any scale; called without gradients."""
+        raise NotImplementedError
 
-        Updates with equal values are relabeled together, so there should be few values.
+    def loss(self, batch: Batch) -> Tensor | None:
+        """[] loss of the parameters for one step of Adam; None if nothing is trained."""
+        return None
 
-        Args:
-            updates: K.
-            transitions: K*B.
-            trajectories: [K*N, T, D] training data, to which columns may be added; None if nothing
-                is trained.
-            generator: the Learner's.
-            first: whether these are the run's first updates.
+    @torch.no_grad()
+    def of_episode(self, observations: Tensor, actions: Tensor) -> Tensor:
+        """[n+1, D], [n, A] -> [n] numbers of a fresh episode, for `Batch.stored`.
+
+        Called once for each episode, with `by_episode`; the replay keeps the numbers.
         """
-
-    def reward(self, states: Tensor, followers: Tensor, drawn: Hashable) -> Tensor:
-        """[B, D] states and next states -> [B]."""
-
-    def total(self, task: Tensor, intrinsic: Tensor, weight: float) -> Tensor:
-        """[B] task reward and intrinsic reward -> [B] reward in the critics' targets."""
-
-    def loss(self, trajectories: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
-        """[N, T, D] -> [] loss of its networks, and metrics by name."""
-
-    def learn(
-        self, states: Tensor, followers: Tensor, drawn: Sequence[Hashable],
-        trajectories: Mapping[str, Tensor], optimizer: FusedAdam,
-    ) -> tuple[Tensor, dict[str, Tensor]]:  # fmt: skip
-        """Update its networks K times on a CPU, without autograd if possible.
-
-        Takes states and next states [K, B, D], the K values of `draw`, and trajectories
-        [K*N, T, D]. Returns [K, B] rewards, each minibatch's before its update, and metrics by
-        name, [K] each.
-        """
-
-    def observe(
-        self, episodes: Sequence[Trajectory], states: Tensor, followers: Tensor,
-        generator: torch.Generator,
-    ) -> Tensor:  # fmt: skip
-        """[steps] reward of fresh episodes, before they are trained on.
-
-        If `reward` depends on the drawn values, this is its mean over them.
-        """
-
-    def priorities(
-        self, episodes: Sequence[Tensor], generator: torch.Generator
-    ) -> NDArray[np.float64]:
-        """[T, D] frames of episodes -> one priority each, for the replay."""
+        raise NotImplementedError
 
     def metrics(self) -> dict[str, float]:
-        """Measures of the fresh episodes since the last call."""
+        """Measures since the last call; their names begin with `intrinsic/`."""
+        return {}
 
-    def state(self) -> Any:
-        """The state for a checkpoint, without the networks."""
+    @torch.no_grad()
+    def reward(self, batch: Batch, *, learning: bool) -> tuple[Tensor, Tensor]:
+        """[B] rewards in [-1, 0] as MUSIC's: clip(bonus / scale, 0, 1) - 1; and [B] bonuses.
 
-    def load_state(self, state: Any) -> None:
-        """Continue from a result of `state`."""
+        Args:
+            batch: the transitions.
+            learning: whether the bonuses count for the scale.
+
+        Raises:
+            ValueError: `bonus` returned another shape.
+        """
+        bonus = self.bonus(batch)
+        if bonus.shape != batch.states.shape[:1]:
+            raise ValueError(
+                f"{type(self).__name__}.bonus must return one number for each transition, of shape "
+                f"{tuple(batch.states.shape[:1])}, got shape {tuple(bonus.shape)}"
+            )
+        if self.scale is not None:
+            return (bonus / self.scale).clamp(0.0, 1.0) - 1.0, bonus
+        if learning:
+            squares = bonus.double().square().sum()
+            self.sums += torch.stack([torch.full_like(squares, len(bonus)), squares])
+        scale = 2.0 * (self.sums[1] / self.sums[0].clamp(min=1.0)).sqrt()
+        scale = scale.clamp(min=max(self.smallest_scale, 1e-12)).to(bonus)
+        return (bonus / scale).clamp(0.0, 1.0) - 1.0, bonus
+
+
+# -- parts of networks ---------------------------------------------------------------------------
+
+
+class Standardized(nn.Module):
+    """Inputs standardized by all that `update` has seen, and clipped to [-5, 5]."""
+
+    moments: Tensor
+    """[1 + 2 F] number of rows, sums and sums of squares of F features."""
+    mean: Tensor
+    factor: Tensor
+
+    def __init__(self, features: int) -> None:
+        super().__init__()
+        self.register_buffer("moments", torch.zeros(1 + 2 * features, dtype=torch.float64))
+        self.register_buffer("mean", torch.zeros(features))
+        self.register_buffer("factor", torch.ones(features))
+
+    @torch.no_grad()
+    def update(self, rows: Tensor) -> None:
+        """Add rows [B, F]."""
+        rows = rows.double()
+        count = rows.new_tensor([len(rows)])
+        self.moments += torch.cat([count, rows.sum(0), rows.square().sum(0)])
+        mean, square = (self.moments[1:] / self.moments[0]).chunk(2)
+        self.mean.copy_(mean)
+        self.factor.copy_((square - mean.square()).clamp(min=1e-4).rsqrt())
+
+    def forward(self, rows: Tensor) -> Tensor:
+        """[..., F] -> standardized [..., F]."""
+        return ((rows - self.mean) * self.factor).clamp(-5.0, 5.0)
+
+
+def perceptron(sizes: Sequence[int]) -> nn.Sequential:
+    """Linear layers of these sizes with ReLU between them."""
+    layers: list[nn.Module] = []
+    for before, after in pairwise(sizes):
+        layers += [nn.Linear(before, after), nn.ReLU()]
+    return nn.Sequential(*layers[:-1])

@@ -31,7 +31,11 @@ the original, each of which draws its own."""
 
 
 class Music:
-    """MUSIC's reward, an `IntrinsicReward`; `estimator` is None if the settings have none."""
+    """MUSIC's reward; `estimator` is None if the settings have none.
+
+    All random numbers come from the generator that is passed in, so that a resumed run draws the
+    same ones.
+    """
 
     def __init__(
         self, settings: MusicSettings, estimator: MutualInformationEstimator | None
@@ -41,10 +45,12 @@ class Music:
 
     @property
     def is_on(self) -> bool:
+        """Whether there is a reward; without one, `draw` and `total` may still be called."""
         return self._estimator is not None
 
     @property
     def learning_rate(self) -> float | None:
+        """Learning rate of the estimator; None if it is not trained."""
         return self._settings.lr if self._settings.estimator == "trained" else None
 
     @property
@@ -60,6 +66,15 @@ class Music:
 
         With `shuffle: random` a minibatch of B rows has ceil(B / `WORKER_ROWS`) draws, each for an
         equal share of its rows, and half of the draws do not swap.
+
+        Args:
+            updates: K; each has one of the returned values, for `reward`. Updates with equal values
+                are relabeled together.
+            transitions: K*B.
+            trajectories: [K*N, T, D] training data, to which columns are added; None if nothing is
+                trained.
+            generator: the Learner's.
+            first: whether these are the run's first updates.
         """
         swapped: list[tuple[bool, ...]] = [(True,)] * updates
         if self._is_random and updates:
@@ -82,16 +97,17 @@ class Music:
 
     @torch.no_grad()
     def reward(self, states: Tensor, followers: Tensor, drawn: Any) -> Tensor:
-        """[B] in [-1, 0]."""
+        """[B, D] states and next states -> [B] in [-1, 0]."""
         bounds = self._network.transition_bounds(states, followers, drawn)
         return intrinsic_reward(bounds, self._settings.reward_scale)
 
     def total(self, task: Tensor, intrinsic: Tensor, weight: float) -> Tensor:
+        """[B] task reward and intrinsic reward -> [B] reward in the critics' targets."""
         weighted = weight * intrinsic
         return task + weighted if self._settings.task_reward else weighted
 
     def loss(self, trajectories: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
-        """The negative mean bound, in nats."""
+        """[N, T, D] trajectories -> [] negative mean bound in nats, and metrics by name."""
         permutations, inside = trajectories["permutations"], trajectories.get("inside")
         bound = self._network.bound(trajectories["obs"], permutations, inside).mean()
         return -bound, {names.MI_BOUND: bound.detach()}
@@ -101,7 +117,11 @@ class Music:
         self, states: Tensor, followers: Tensor, drawn: Sequence[Any],
         trajectories: Mapping[str, Tensor], optimizer: FusedAdam,
     ) -> tuple[Tensor, dict[str, Tensor]]:  # fmt: skip
-        """K updates by compiled code."""
+        """K updates by compiled code.
+
+        Takes states and next states [K, B, D], the K values of `draw`, and trajectories
+        [K*N, T, D]. Returns [K, B] rewards, each minibatch's before its update, and metrics [K].
+        """
         updates, rows = states.shape[:2]
         network = self._network
         pairs = network.pairs(states, followers).flatten(0, 1)
@@ -120,7 +140,9 @@ class Music:
         self, episodes: Sequence[Trajectory], states: Tensor, followers: Tensor,
         generator: torch.Generator,
     ) -> Tensor:  # fmt: skip
-        """With `shuffle: random`, the mean of the rewards with and without swap.
+        """[steps] reward of fresh episodes, before they are trained on.
+
+        With `shuffle: random`, the mean of the rewards with and without swap.
 
         The critics learn this mean, because half of the draws swap.
         """
@@ -162,14 +184,17 @@ class Music:
         return sums.cpu().numpy().astype(np.float64)
 
     def metrics(self) -> dict[str, float]:
+        """Measures of the fresh episodes since the last call."""
         total, steps = self.state()
         self.load_state((0.0, 0.0))
         return {names.HELD_OUT_BOUND: total / steps, HELD_OUT_STEPS: steps} if steps else {}
 
     def state(self) -> list[float]:
+        """The state for a checkpoint, without the estimator."""
         return [self._held_out_sum, self._held_out_steps]
 
     def load_state(self, state: Sequence[float]) -> None:
+        """Continue from a result of `state`."""
         self._held_out_sum, self._held_out_steps = state
 
 

@@ -1,12 +1,66 @@
-"""Named, validated settings of MUSIC (paper III-A)."""
+"""Named, validated settings of MUSIC (paper III-A) and of other intrinsic rewards."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, JsonValue, model_validator
 
 from music_rllib.schedules import AdaptiveSchedule, StrictModel, bounded
+
+BUILT_IN: Mapping[str, str] = MappingProxyType(
+    {
+        "displacement": "music_rllib.intrinsic.baselines:Displacement",
+        "random": "music_rllib.intrinsic.baselines:RandomBonus",
+        "rnd": "music_rllib.intrinsic.novelty:RND",
+        "icm": "music_rllib.intrinsic.novelty:ICM",
+        "disagreement": "music_rllib.intrinsic.novelty:Disagreement",
+        "e3b": "music_rllib.intrinsic.novelty:E3B",
+        "diayn": "music_rllib.intrinsic.skills:DIAYN",
+        "discern": "music_rllib.intrinsic.skills:DISCERN",
+    }
+)
+"""Values of `intrinsic.reward` and the classes that they stand for."""
+
+
+def _known_reward(name: str) -> str:
+    module, colon, attribute = name.partition(":")
+    parts = [*module.split("."), attribute]
+    if name not in BUILT_IN and not (colon and all(map(str.isidentifier, parts))):
+        known = ", ".join(BUILT_IN)
+        raise ValueError(f"must be {known}, or module:Class of your own, got {name!r}")
+    return name
+
+
+class IntrinsicSettings(StrictModel):
+    """An intrinsic reward that is added to all others (docs/intrinsic_rewards.md)."""
+
+    reward: Annotated[str, AfterValidator(_known_reward)] | None = None
+    """Name of a built-in reward, or `module:Class` of your own; null: none. Built in:
+    displacement, random, rnd, icm, disagreement, e3b, diayn, discern."""
+    weight: Annotated[AdaptiveSchedule, bounded(">= 0", lambda w: w >= 0)] = 0.1
+    """Weight of the reward, which lies in [-1, 0]. A schedule that ends at 0 leaves the optimum of
+    the task unchanged at the end. 1 for intrinsic-u."""
+    lr: float = Field(1e-3, gt=0)
+    """Adam's step size for its networks, which take one step per update."""
+    settings: dict[str, JsonValue] = Field(default_factory=dict)
+    """Keyword arguments of its class, such as `{hidden: 128}`."""
+    frozen: bool = False
+    """Whether its networks are of another run and not trained; fixed by the variant."""
+
+    @property
+    def identity(self) -> str:
+        """The reward and its own settings as text: what determines the shapes of its networks."""
+        return f"{self.reward} {json.dumps(self.settings, sort_keys=True)}"
+
+    @property
+    def own_module(self) -> str | None:
+        """The user's module that it imports."""
+        own = self.reward is not None and self.reward not in BUILT_IN
+        return str(self.reward).partition(":")[0] if own else None
 
 
 class MusicSettings(StrictModel):
@@ -50,6 +104,9 @@ class MusicSettings(StrictModel):
             )
         if self.prioritise_replay and self.estimator == "none":
             raise ValueError("prioritise_replay: true needs an estimator, got estimator: none")
-        if not self.task_reward and self.estimator == "none":
-            raise ValueError("task_reward: false without an estimator leaves no reward at all")
         return self
+
+    def check_has_reward(self, intrinsic: IntrinsicSettings) -> None:
+        """Raise ValueError if there is neither the task's reward nor an intrinsic one."""
+        if not self.task_reward and self.estimator == "none" and intrinsic.reward is None:
+            raise ValueError("task_reward: false without an estimator leaves no reward at all")

@@ -93,6 +93,8 @@ class TrajectoryReplay(TrajectoryRing):
         self._moved = np.zeros(0, np.bool_)
         self._priorities = np.zeros(0, np.float64)
         self._cumulative_ranks: Weights | None = None
+        self._values: Floats | None = None
+        """Numbers of each row for an intrinsic reward, from the first `extend` with some."""
         self._td = None if td_exponent is None else TDPriorities(len(self._steps), td_exponent)
         self._refresh()
 
@@ -101,11 +103,13 @@ class TrajectoryReplay(TrajectoryRing):
         return self._all_places.total
 
     def extend(
-        self, trajectories: Sequence[Trajectory], priorities: NDArray[np.float64] | None = None
-    ) -> None:
+        self, trajectories: Sequence[Trajectory], priorities: NDArray[np.float64] | None = None,
+        values: Sequence[Floats] | None = None,
+    ) -> None:  # fmt: skip
         """Store finished episodes in place of the oldest ones.
 
-        MUSIC-p gives `priorities` [N] with every call: episodes are drawn by their rank.
+        MUSIC-p gives `priorities` [N] with every call: episodes are drawn by their rank. An
+        intrinsic reward by episode gives N arrays of `values` [n], one for each step.
         """
         for i, trajectory in enumerate(trajectories):
             start, steps = self._store(trajectory), len(trajectory)
@@ -115,7 +119,18 @@ class TrajectoryReplay(TrajectoryRing):
                 self._td.add(start, steps)
             if priorities is not None:
                 self._priorities = np.append(self._priorities, priorities[i])
+            if values is not None:
+                self._row_values()[start : start + steps] = values[i]
         self._refresh()
+
+    def _row_values(self) -> Floats:
+        if self._values is None:
+            self._values = np.zeros(len(self._steps), np.float32)
+        return self._values
+
+    def values_of(self, rows: Rows) -> Floats | None:
+        """The values that `extend` got for these rows [B]; None if it got none."""
+        return None if self._values is None else self._values[rows]
 
     def _refresh(self) -> None:
         """Prepare sampling from the trajectories that are held now."""
@@ -249,10 +264,12 @@ class TrajectoryReplay(TrajectoryRing):
     def index(self) -> dict[str, Any]:
         """The state except `packed`: rows of trajectories, priorities, generator.
 
-        24 bytes a trajectory, and with priorities by TD error 8 bytes a transition.
+        24 bytes a trajectory, with priorities by TD error 8 bytes a transition, and with values of
+        an intrinsic reward 4 bytes.
         """
         td = None if self._td is None else self._td.packed(ranges(self._starts, self._lengths))
-        return {
+        values = self.values_of(ranges(self._starts, self._lengths))
+        return ({} if values is None else {"values": values}) | {
             "starts": self._starts.copy(),
             "lengths": self._lengths.copy(),
             "priorities": self._priorities.copy(),
@@ -294,6 +311,8 @@ class TrajectoryReplay(TrajectoryRing):
                 f"trajectory {wanted} must be in the checkpoint's files, but is missing"
             )
         self._priorities = np.array(index["priorities"], np.float64)
+        if "values" in index:
+            self._row_values()[ranges(self._starts, self._lengths)] = index["values"]
         if self._only_moved:
             episodes = zip(self._starts.tolist(), self._lengths.tolist(), strict=True)
             moved = [self._has_moved(start, steps) for start, steps in episodes]

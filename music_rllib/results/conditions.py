@@ -99,7 +99,7 @@ class StageRuns:
     @property
     def has_task_reward(self) -> bool:
         """Whether its runs are trained for success."""
-        return self.variant != "music-u"
+        return self.variant not in {"music-u", "intrinsic-u"}
 
 
 def stages_together(stages: Sequence[StageRuns]) -> StageRuns | None:

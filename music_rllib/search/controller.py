@@ -199,7 +199,7 @@ class SearchController(Listener):
     def _is_current(self, node: Node) -> bool:
         """Whether a node in the store was computed with the environment of today."""
         found = self._store.environment(node.key)
-        return not self._environments.differences(node.run.task.name, found)
+        return not self._environments.differences(node.run.code, found)
 
     def _request_rung(self, search: Search, one: RunningTrial) -> None:
         """Ask for the runs up to the trial's rung."""

@@ -161,7 +161,8 @@ def _determined_by(sweep: OpenSweep, stage: Stage) -> dict[str, Any]:
     )
     checkpoint = source.checkpoint if source is not None else None
     # Values of another environment do not count. The earliest stands for all equal ones.
-    tasks = sorted({*point.runs, *source_runs} & sweep.environments.now.keys())
+    codes = {run.code for run in (*point.runs.values(), *source_runs.values())}
+    tasks = sorted(codes & sweep.environments.now.keys())
     environments = {task: sweep.environments.earliest(task) for task in tasks}
     return {
         **({"environments": environments} if environments else {}),

@@ -62,12 +62,17 @@ class Architecture(_Strict):
     """Meaning of the policy's outputs."""
     log_std_bounds: tuple[float, float] | None
     """Range to which the form `tanh` scales; other forms only clip to it."""
+    intrinsic: str | None = None
+    """An intrinsic reward and its settings."""
 
     def differences(self, other: Architecture, starts_from: str) -> list[str]:
         """Settings that prevent a run from starting from these weights, named as in YAML."""
         if starts_from == "estimator":
             fits = self.estimator_hidden_size == other.estimator_hidden_size
             return [] if fits else ["music.hidden_size"]
+        if starts_from == "intrinsic":
+            names = ["intrinsic.reward and intrinsic.settings"]
+            return [] if self.intrinsic == other.intrinsic else names
         fields = ["hidden_sizes", "layer_norm", "policy", "bootstrap", "normalise_observations"]
         fields += ["critics", "quantiles", "log_std_form"]
         if self.log_std_form == other.log_std_form:

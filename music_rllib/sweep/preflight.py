@@ -89,17 +89,17 @@ def check_environments(plan: Plan, hang_minutes: float | None = None) -> list[st
 
 
 def fingerprints(plan: Plan) -> dict[str, Fingerprint]:
-    """The fingerprint of each task's environment, by the task's name; imports users' modules.
+    """The fingerprint of each task's environment, by `RunSettings.code`; imports users' modules.
 
     Raises:
-        TaskError: The module of an environment can't be imported.
+        TaskError: The module of an environment or of an intrinsic reward can't be imported.
     """
     found = {}
-    for task in {run.task.name: run.task for run in plan.settings}.values():
+    for code, run in {run.code: run for run in plan.settings}.items():
         try:
-            found[task.name] = fingerprint_of(task.env_id, task.env_kwargs)
+            found[code] = fingerprint_of(run.task.env_id, run.task.env_kwargs, run.own_modules)
         except Exception as error:  # a user's module may raise anything
-            raise TaskError(f"environments.{task.name} must be importable: {error}") from error
+            raise TaskError(f"environments.{code} must be importable: {error}") from error
     return found
 
 

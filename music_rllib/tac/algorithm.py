@@ -32,13 +32,19 @@ from ray.rllib.utils.typing import StateDict
 from music_rllib.envs.episodes import Episode
 from music_rllib.envs.make import goal_reward_of, moved_distance_of
 from music_rllib.envs.values import BadNumberError
+from music_rllib.intrinsic.relabeling import reward_class
 from music_rllib.replay.buffer import TrajectoryReplay
-from music_rllib.replay.trajectories import WholeTrajectories
+from music_rllib.replay.trajectories import Floats, WholeTrajectories
 from music_rllib.schedules import value_at
 from music_rllib.tac.config import AlgorithmSettings, TACConfigBase
 from music_rllib.tac.env_runner import SUCCESS_LAST, TrajectoryEnvRunner, seed_or_entropy
-from music_rllib.tac.minibatches import batch_of
-from music_rllib.tac.rl_module import NetworkWeights, states_by_module, weights_by_network
+from music_rllib.tac.minibatches import INTRINSIC, batch_of
+from music_rllib.tac.rl_module import (
+    ESTIMATOR_MODULE,
+    NetworkWeights,
+    states_by_module,
+    weights_by_network,
+)
 
 REVIVE_SECONDS = 300.0
 """Longest wait for the restart of a remote environment runner that died."""
@@ -60,6 +66,8 @@ class TAC(Algorithm):
         with _determinism_without_compiler():
             super().setup(config)
         self._settings: AlgorithmSettings = self.config.settings
+        name = self._settings.intrinsic.reward
+        self._reward = None if name is None else reward_class(name)
         self.env_steps = 0
         """Environment steps of all runners."""
         self.grad_updates = 0
@@ -123,14 +131,18 @@ class TAC(Algorithm):
         self._observe_inputs(episodes)
         if explored:
             self.learner_group.foreach_learner(lambda learner: learner.diagnose(episodes))
-        self.replay.extend(episodes, self._trajectory_priorities(episodes))
+        self.replay.extend(
+            episodes, self._trajectory_priorities(episodes), self._values_to_store(episodes)
+        )
         for updates in self._updates_due():
             with self.metrics.log_time((TIMERS, REPLAY_BUFFER_SAMPLE_TIMER)):
                 drawn = self.replay.sample_transitions(
                     updates * self._settings.tac.batch_size,
                     importance_exponent=self._importance_exponent,
                 )
-                batch = batch_of(drawn, self._sample_trajectories(updates))
+                batch = batch_of(
+                    drawn, self._sample_trajectories(updates), self.replay.values_of(drawn.rows)
+                )
             with self.metrics.log_time((TIMERS, LEARNER_UPDATE_TIMER)):
                 results = self.learner_group.update(
                     batch=batch, timesteps={NUM_ENV_STEPS_SAMPLED_LIFETIME: self.env_steps}
@@ -243,6 +255,13 @@ class TAC(Algorithm):
         )
         return priorities
 
+    def _values_to_store(self, episodes: list[Episode]) -> list[Floats] | None:
+        """Numbers of each step that the replay keeps for an intrinsic reward by episode."""
+        if self._reward is None or not self._reward.by_episode:
+            return None
+        values: list[Floats] = self._call_learner(lambda learner: learner.bonus.values_of(episodes))
+        return values
+
     def _call_learner(self, function: Callable[[Any], Any]) -> Any:
         return next(iter(self.learner_group.foreach_learner(function))).get()
 
@@ -258,27 +277,39 @@ class TAC(Algorithm):
         schedule, budget = self._settings.replay.importance_exponent, self.config.total_env_steps
         return value_at(schedule, self.env_steps, budget or 0)
 
-    def _sample_trajectories(self, updates: int) -> WholeTrajectories | None:
-        """The estimator's part of the minibatches; None if it is not trained."""
-        _, music, _, split = self._settings
-        if music.estimator != "trained":
-            return None
-        last = max(*split.agent_indices, *split.surrounding_indices)
-        return self.replay.sample_trajectories(updates * music.batch_trajectories, width=last + 1)
+    def _sample_trajectories(self, updates: int) -> dict[str, WholeTrajectories]:
+        """The trajectories of the estimator and of another intrinsic reward, if they need some."""
+        music, split, found = self._settings.music, self._settings.split, {}
+        sample = self.replay.sample_trajectories
+        if music.estimator == "trained":
+            last = max(*split.agent_indices, *split.surrounding_indices)
+            count = updates * music.batch_trajectories
+            found[ESTIMATOR_MODULE] = sample(count, width=last + 1)
+        if self._reward is not None and self._reward.trajectories:
+            found[INTRINSIC] = sample(updates * self._reward.trajectories)
+        return found
 
     # -- network weights ------------------------------------------------------------------
 
     def get_network_weights(self) -> NetworkWeights:
         """Weights by network (policy, critics, value, value_target, normaliser, ...) and array."""
         state = self.learner_group.get_state(components="learner/rl_module")["learner"]["rl_module"]
-        return weights_by_network(state)
+        weights = weights_by_network(state)
+        if self._reward is not None:
+            weights[INTRINSIC] = self._call_learner(lambda learner: learner.bonus.weights())
+        return weights
 
     def set_network_weights(self, weights: Mapping[str, Mapping[str, NDArray[Any]]]) -> None:
         """Load the given networks, as `get_network_weights` returns them; keep the others.
 
         Raises ValueError for an unknown network, and for missing, unknown or misshapen tensors.
         """
+        # This also checks the networks of an intrinsic reward, which no module holds.
         modules = states_by_module(weights, self.get_network_weights())
+        if (of_reward := weights.get(INTRINSIC)) is not None:
+            self.learner_group.foreach_learner(
+                lambda learner: learner.bonus.load_weights(of_reward)
+            )
         self.learner_group.foreach_learner(
             lambda learner: [learner.module[mid].set_state(state) for mid, state in modules.items()]
         )

@@ -15,9 +15,7 @@ from music_rllib.config.problems import problems_of
 from music_rllib.config.run_settings import ReplaySettings
 from music_rllib.config.tac_settings import TACSettings
 from music_rllib.envs.tasks import LAST_SEED, Indices, check_split
-from music_rllib.intrinsic.interface import IntrinsicReward
-from music_rllib.intrinsic.music import Music
-from music_rllib.intrinsic.settings import MusicSettings
+from music_rllib.intrinsic.settings import IntrinsicSettings, MusicSettings
 from music_rllib.runtime.quiet import quiet_third_parties
 from music_rllib.schedules import Linear, Measured, StrictModel, check_measurable
 from music_rllib.tac.env_runner import TrajectoryEnvRunner
@@ -47,6 +45,7 @@ class AlgorithmSettings(NamedTuple):
     music: MusicSettings
     replay: ReplaySettings
     split: Split
+    intrinsic: IntrinsicSettings = IntrinsicSettings()
 
 
 class TACConfigBase(AlgorithmConfig):
@@ -141,6 +140,17 @@ class TACConfigBase(AlgorithmConfig):
             surrounding_indices=surrounding_indices,
         )
 
+    def intrinsic(self, **settings: Any) -> Self:
+        """Add an intrinsic reward to the task's and MUSIC's.
+
+        Args:
+            **settings: fields of `IntrinsicSettings`.
+
+        Raises:
+            TypeError: unknown setting.
+        """
+        return self._set(_prefixed("intrinsic", settings, IntrinsicSettings))
+
     def replay(self, *, moved_distance: float | None = NotProvided, **settings: Any) -> Self:
         """Set the hyperparameters of replay and hindsight.
 
@@ -206,6 +216,7 @@ class TACConfigBase(AlgorithmConfig):
                 music=self._validated(MusicSettings, "music_"),
                 replay=self._validated(ReplaySettings, "replay_"),
                 split=self._validated(Split, ""),
+                intrinsic=self._validated(IntrinsicSettings, "intrinsic_"),
             )
             self.__dict__["_settings"] = found  # also if the config is frozen
             return found
@@ -224,7 +235,7 @@ class TACConfigBase(AlgorithmConfig):
         if not self.in_evaluation and (problems := list(ignored_settings(self))):
             self._value_error("\n".join(problems))
         super().validate()
-        tac, music, replay, split = self.settings
+        tac, music, replay, split, intrinsic = self.settings
         if self.in_evaluation:
             return
         if self.num_learners > 1:
@@ -237,29 +248,37 @@ class TACConfigBase(AlgorithmConfig):
                 "replay_hindsight_k must be 0 with music_goals='zero' (hindsight would replace "
                 f"the zeros by achieved goals), got {replay.hindsight_k:g}"
             )
-        if problem := replay.problem(music):
+        try:
+            music.check_has_reward(intrinsic)
+        except ValueError as error:
+            self._value_error(f"music_{error}")
+        if problem := replay.problem(music, intrinsic):
             self._value_error(f"replay_{problem}")
         schedules = (
             tac.entropic_index,
             getattr(tac.alpha, "value", tac.alpha),
             music.mi_reward_weight,
+            intrinsic.weight,
             replay.importance_exponent,
         )
         if any(isinstance(s, Linear) for s in schedules) and not self.total_env_steps:
             self._value_error(
                 "a linear schedule needs the budget: set training(total_env_steps=...)"
             )
-        self._check_adaptive(tac, music)
+        self._check_adaptive(tac, music, intrinsic)
         if music.estimator != "none" and not split.agent_indices:
             self._value_error(
                 "MUSIC needs to know the agent's and the surrounding state: set "
                 "music(agent_indices=[...], surrounding_indices=[...])"
             )
 
-    def _check_adaptive(self, tac: TACSettings, music: MusicSettings) -> None:
+    def _check_adaptive(
+        self, tac: TACSettings, music: MusicSettings, intrinsic: IntrinsicSettings
+    ) -> None:
         adaptive = {
             "entropic_index": tac.entropic_index,
             "music_mi_reward_weight": music.mi_reward_weight,
+            "intrinsic_weight": intrinsic.weight,
         }
         success, entropy = self.success_key is not None, tac.policy == "stochastic"
         check_measurable(adaptive, success=success, entropy=entropy)
@@ -301,19 +320,13 @@ class TACConfigBase(AlgorithmConfig):
             spec.add_modules({ESTIMATOR_MODULE: estimator})
         return spec
 
-    def intrinsic_reward(self, networks: Any) -> IntrinsicReward:
-        """The reward that the Learner adds; a subclass may return another one.
-
-        `networks` is the module `ESTIMATOR_MODULE`; None if the settings have no estimator.
-        """
-        return Music(self.settings.music, networks and networks.estimator)
-
 
 _MODELS: tuple[tuple[type[BaseModel], str], ...] = (
     (TACSettings, ""),
     (MusicSettings, "music_"),
     (ReplaySettings, "replay_"),
     (Split, ""),
+    (IntrinsicSettings, "intrinsic_"),
 )
 """Types of `AlgorithmSettings`, and the prefix of their fields as attributes of the config."""
 _FIELDS = frozenset(prefix + name for model, prefix in _MODELS for name in model.model_fields)

@@ -76,7 +76,7 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
         self.worker_index: int = self.worker_index or 0
         self._env_creator = kwargs.get("env_creator")
         self._spaces = kwargs.get("spaces")
-        tac, music, replay, self._split = self.config.settings
+        tac, music, replay, self._split, _ = self.config.settings
         self._settings: TACSettings = tac
         training = not self.config.in_evaluation
         self._zero_goals = training and music.goals == "zero"

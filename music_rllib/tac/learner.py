@@ -25,7 +25,10 @@ from torch import Tensor
 
 from music_rllib import names
 from music_rllib.config.tac_settings import LearnedAlpha, TACSettings
-from music_rllib.intrinsic.interface import IntrinsicReward
+from music_rllib.envs.values import observation_sizes
+from music_rllib.intrinsic.interface import Sizes
+from music_rllib.intrinsic.music import Music
+from music_rllib.intrinsic.relabeling import RewardLearner, make_reward
 from music_rllib.replay.trajectories import Trajectory
 from music_rllib.runtime.process import keep_freed_memory
 from music_rllib.runtime.quiet import quiet_third_parties
@@ -34,7 +37,7 @@ from music_rllib.tac import diagnostics
 from music_rllib.tac.compiled_update import CompiledUpdate, FusedAdam, needs_autograd, use_threads
 from music_rllib.tac.diagnostics import FreshEpisodes, critic_bias
 from music_rllib.tac.losses import Losses, ScheduledSettings, TACLoss
-from music_rllib.tac.minibatches import Minibatch, Minibatches
+from music_rllib.tac.minibatches import INTRINSIC, STORED, Minibatch, Minibatches
 from music_rllib.tac.networks import RunningNormaliser
 from music_rllib.tac.rl_module import ESTIMATOR_MODULE, TACForward, TACModule, mean_values
 
@@ -60,9 +63,11 @@ class TACLearner(TorchLearner):
         self._losses: dict[str, Tensor] = {}
         self._observed: dict[str, Tensor] = {}
         self._td_errors: Tensor | None = None
-        music, budget = self.config.settings.music, self.config.total_env_steps or 0
+        settings, budget = self.config.settings, self.config.total_env_steps or 0
         actions = self._policy_module.action_size
-        self._now = ScheduledSettings(self._settings, music, budget, actions)
+        self._now = ScheduledSettings(
+            self._settings, settings.music, settings.intrinsic, budget, actions
+        )
         self._objective = TACLoss(self._settings, self._policy_module, self._now)
         pairs = self._policy_module.get_target_network_pairs()
         self._online: list[Tensor] = [p for online, _ in pairs for p in online.parameters()]
@@ -70,14 +75,22 @@ class TACLearner(TorchLearner):
         self._compiled: CompiledUpdate | None = None
         if self._device.type == "cpu" and not self._needs_autograd:
             self._compiled = CompiledUpdate(self._policy_module)
+        self.bonus: RewardLearner | None = None
+        """The intrinsic reward that is added to MUSIC's."""
+        if (intrinsic := settings.intrinsic).reward is not None:
+            observation, goal = observation_sizes(self._policy_module.observation_space)
+            sizes = Sizes(observation, goal, actions, *dict(settings.split).values())
+            reward = make_reward(intrinsic, sizes, seed + 4241).to(self._device)
+            self.bonus = RewardLearner(reward, intrinsic.lr, frozen=intrinsic.frozen)
 
     @cached_property
-    def _intrinsic(self) -> IntrinsicReward:
-        return self.config.intrinsic_reward(self._estimator)  # type: ignore[no-any-return]
+    def _music(self) -> Music:
+        networks = self._estimator
+        return Music(self.config.settings.music, networks and networks.estimator)
 
     @property
     def _estimator(self) -> Any:
-        """The module of the intrinsic reward's networks, if there is one."""
+        """The module of MUSIC's estimator, if there is one."""
         has_one = ESTIMATOR_MODULE in self.module
         return self.module[ESTIMATOR_MODULE].unwrapped() if has_one else None
 
@@ -95,7 +108,7 @@ class TACLearner(TorchLearner):
         log_alpha = named.pop("log_alpha", None)
         weights = [p for p in named.values() if p.requires_grad]
         if module_id == ESTIMATOR_MODULE:
-            if (lr := self._intrinsic.learning_rate) is not None:
+            if (lr := self._music.learning_rate) is not None:
                 self._register(module_id, "estimator", weights, lr)
             return
         self._register(module_id, "networks", weights, self._settings.lr)
@@ -166,8 +179,8 @@ class TACLearner(TorchLearner):
         history = []
         for part in minibatches.one_by_one() if "alpha" in self._adam else (minibatches,):
             self._losses, self._observed = {}, {}
-            rewards = functools.partial(self._learn_intrinsic, part)
-            self._update_compiled(self._relabelled(part.columns, rewards))
+            rewards = functools.partial(self._learn_music, part)
+            self._update_compiled(self._relabelled(part, rewards))
             self._grad_updates += part.updates
             history.append(self._losses | self._observed)
         return {name: torch.cat([each[name] for each in history]) for name in history[0]}
@@ -190,8 +203,8 @@ class TACLearner(TorchLearner):
         self._losses, self._observed = {}, {}
         policy, (drawn,) = minibatch.columns[DEFAULT_MODULE_ID], minibatch.drawn
         ends = (policy[Columns.OBS], policy[Columns.NEXT_OBS])
-        rewards = functools.partial(self._intrinsic.reward, *ends, drawn)
-        self._update(self._relabelled(minibatch.columns, rewards))
+        rewards = functools.partial(self._music.reward, *ends, drawn)
+        self._update(self._relabelled(minibatch, rewards))
         return self._losses | self._observed
 
     def _minibatches(self, batch: MultiAgentBatch) -> Minibatches:
@@ -206,7 +219,7 @@ class TACLearner(TorchLearner):
             order = torch.rand(size, generator=self._generator, device=self._device).argsort(1)
             policy["target_critics"] = order[:, :some].flatten()
         trajectories, first = columns.get(ESTIMATOR_MODULE), self._grad_updates == 0
-        drawn = self._intrinsic.draw(updates, rows, trajectories, self._generator, first=first)
+        drawn = self._music.draw(updates, rows, trajectories, self._generator, first=first)
         return Minibatches(columns, drawn)
 
     def _policy_noise(self, actions: Tensor) -> dict[str, Tensor]:
@@ -217,15 +230,32 @@ class TACLearner(TorchLearner):
         options = {"generator": self._generator, "device": self._device}
         return {name: torch.randn(actions.shape, **options) for name in columns}
 
-    def _relabelled(self, minibatch: Minibatch, intrinsic_of: Callable[[], Tensor]) -> Minibatch:
-        """The minibatch with the total reward: the task's and the weighted intrinsic one."""
-        if not self._intrinsic.is_on:
-            return minibatch
-        policy = minibatch[DEFAULT_MODULE_ID]
-        self._observed["intrinsic"] = intrinsic = intrinsic_of()
-        weight = self._now.mi_reward_weight
-        reward = self._intrinsic.total(policy[Columns.REWARDS], intrinsic.flatten(), weight)
-        return {**minibatch, DEFAULT_MODULE_ID: {**policy, Columns.REWARDS: reward}}
+    def _relabelled(self, minibatches: Minibatches, music_of: Callable[[], Tensor]) -> Minibatch:
+        """The minibatches with the total reward: the task's and the weighted intrinsic ones."""
+        columns = dict(minibatches.columns)
+        trajectories = columns.pop(INTRINSIC, {})
+        policy = columns[DEFAULT_MODULE_ID]
+        reward = policy[Columns.REWARDS]
+        if self._music.is_on:
+            self._observed["intrinsic"] = music = music_of()
+            reward = self._music.total(reward, music.flatten(), self._now.mi_reward_weight)
+        if self.bonus is not None:
+            batch = self.bonus.batch(
+                policy[Columns.OBS], policy[Columns.ACTIONS], policy[Columns.NEXT_OBS],
+                self._generator, policy.get(STORED), trajectories,
+            )  # fmt: skip
+            bonus, metrics = self.bonus.learn(batch, minibatches.updates)
+            if self._compiled is None:  # one update, whose metrics are stacked later
+                metrics = {name: value[0] for name, value in metrics.items()}
+            self._losses |= metrics
+            reward = self._with_bonus(reward, bonus.flatten())
+        return {**columns, DEFAULT_MODULE_ID: {**policy, Columns.REWARDS: reward}}
+
+    def _with_bonus(self, reward: Tensor, bonus: Tensor) -> Tensor:
+        """[B] rewards so far and the bonus reward -> [B] total."""
+        if not (self.config.settings.music.task_reward or self._music.is_on):
+            reward = torch.zeros_like(reward)
+        return reward + self._now.intrinsic_weight * bonus
 
     def compute_loss_for_module(
         self, *, module_id: ModuleID, config: Any, batch: dict[str, Any], fwd_out: dict[str, Any]
@@ -249,7 +279,7 @@ class TACLearner(TorchLearner):
 
     def loss_of_trajectories(self, batch: Mapping[str, Tensor]) -> Tensor:
         """The loss of the intrinsic reward's networks; called by their module."""
-        loss, metrics = self._intrinsic.loss(batch)
+        loss, metrics = self._music.loss(batch)
         self._losses |= metrics
         return loss
 
@@ -270,13 +300,13 @@ class TACLearner(TorchLearner):
             )
             self._adam["alpha"].step()
 
-    def _learn_intrinsic(self, minibatches: Minibatches) -> Tensor:
+    def _learn_music(self, minibatches: Minibatches) -> Tensor:
         """[K, B] intrinsic rewards, each minibatch's before the update of its networks."""
         if "estimator" not in self._adam:
-            return minibatches.intrinsic_rewards(self._intrinsic)
+            return minibatches.music_rewards(self._music)
         states, followers = minibatches.transitions
         trajectories = minibatches.columns[ESTIMATOR_MODULE]
-        rewards, metrics = self._intrinsic.learn(
+        rewards, metrics = self._music.learn(
             states, followers, minibatches.drawn, trajectories, self._adam["estimator"]
         )
         self._losses |= metrics
@@ -300,7 +330,9 @@ class TACLearner(TorchLearner):
             losses = outputs[names.POLICY_LOSS][improving]
             del means[names.POLICY_LOSS]
             means |= {names.POLICY_LOSS: float(losses.mean())} if any(improving) else {}
-        measured = {**means, **self._now.metrics(), **self._intrinsic.metrics(), names.ALPHA: alpha}
+        measured = {**means, **self._now.metrics(), **self._music.metrics(), names.ALPHA: alpha}
+        if self.bonus is not None:
+            measured |= self.bonus.reward.metrics()
         for key, value in measured.items():
             log((DEFAULT_MODULE_ID, key), value, window=1)
         log((ALL_MODULES, GRAD_UPDATES), self._grad_updates, window=1)
@@ -317,10 +349,13 @@ class TACLearner(TorchLearner):
         """
         fresh = FreshEpisodes.of(episodes, self._policy_module.input_size, self._device)
         rewards = fresh.rewards
-        if self._intrinsic.is_on:
-            states, followers = fresh.states, fresh.followers
-            intrinsic = self._intrinsic.observe(episodes, states, followers, self._generator)
-            rewards = self._intrinsic.total(rewards, intrinsic, self._now.mi_reward_weight)
+        states, followers = fresh.states, fresh.followers
+        if self._music.is_on:
+            intrinsic = self._music.observe(episodes, states, followers, self._generator)
+            rewards = self._music.total(rewards, intrinsic, self._now.mi_reward_weight)
+        if self.bonus is not None:
+            batch = self.bonus.batch(states, fresh.actions, followers, self._generator)
+            rewards = self._with_bonus(rewards, self.bonus.observe(batch, episodes))
         noise = self._policy_noise(fresh.actions)
         bias = critic_bias(fresh, rewards, self._policy_module, self._objective, noise)
         self.metrics.log_value((DEFAULT_MODULE_ID, names.Q_BIAS), bias, window=1)
@@ -329,7 +364,7 @@ class TACLearner(TorchLearner):
     def trajectory_priorities(self, episodes: Sequence[Trajectory]) -> NDArray[np.float64]:
         """[N] priorities of the episodes in the replay."""
         frames = [torch.tensor(e.frames, device=self._device) for e in episodes]
-        return self._intrinsic.priorities(frames, self._generator)
+        return self._music.priorities(frames, self._generator)
 
     def take_td_errors(self) -> NDArray[np.float32]:
         """[K*B] absolute TD errors of the last call's transitions, for prioritised replay."""
@@ -352,9 +387,11 @@ class TACLearner(TorchLearner):
         state["tac"] = {
             "generator": self._generator.get_state().numpy(),
             GRAD_UPDATES: self._grad_updates,
-            "held_out": self._intrinsic.state(),
+            "held_out": self._music.state(),
             "scheduled": self._now.state(),
         }
+        if self.bonus is not None:
+            state["tac"]["intrinsic"] = self.bonus.state()
         return state
 
     def set_state(self, state: StateDict) -> None:
@@ -364,5 +401,7 @@ class TACLearner(TorchLearner):
         if "tac" in state:
             self._generator.set_state(torch.from_numpy(state["tac"]["generator"].copy()))
             self._grad_updates = int(state["tac"][GRAD_UPDATES])
-            self._intrinsic.load_state(state["tac"]["held_out"])
+            self._music.load_state(state["tac"]["held_out"])
             self._now.load_state(state["tac"]["scheduled"])
+            if self.bonus is not None and "intrinsic" in state["tac"]:
+                self.bonus.load_state(state["tac"]["intrinsic"])

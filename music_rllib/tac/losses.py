@@ -17,34 +17,38 @@ from music_rllib import names
 from music_rllib.config.tac_settings import LearnedAlpha, TACSettings, alpha_at
 from music_rllib.functional import actor_critic
 from music_rllib.functional.distribution import ln_q_of_policy
-from music_rllib.intrinsic.settings import MusicSettings
+from music_rllib.intrinsic.settings import IntrinsicSettings, MusicSettings
 from music_rllib.schedules import Follower, Measured, Quantity, value_at
 from music_rllib.tac.rl_module import Bootstrap, TACForward, TACModule
 
 
 class ScheduledSettings:
-    """q, alpha and the weight of the intrinsic reward at the time of the last `advance`.
+    """q, alpha and the weights of intrinsic rewards at the time of the last `advance`.
 
     Args:
         tac: settings of TAC.
         music: settings of MUSIC.
+        intrinsic: settings of another intrinsic reward.
         total_env_steps: the run's budget; 0 if it is unknown.
         actions: number of action dimensions.
     """
 
     entropic_index: float
     mi_reward_weight: float
+    intrinsic_weight: float
     alpha: float
     """Alpha at the current q; unused if alpha is learned."""
 
     def __init__(
-        self, tac: TACSettings, music: MusicSettings, total_env_steps: int, actions: int
-    ) -> None:
-        self._tac, self._music = tac, music
+        self, tac: TACSettings, music: MusicSettings, intrinsic: IntrinsicSettings,
+        total_env_steps: int, actions: int,
+    ) -> None:  # fmt: skip
+        self._tac, self._music, self._intrinsic = tac, music, intrinsic
         self._total, self._actions = total_env_steps, actions
         adaptive = {
             names.ENTROPIC_INDEX: tac.entropic_index,
             names.MI_REWARD_WEIGHT: music.mi_reward_weight,
+            names.INTRINSIC_WEIGHT: intrinsic.weight if intrinsic.reward else 0.0,
         }
         self._followers = {
             name: Follower(value) for name, value in adaptive.items() if isinstance(value, Measured)
@@ -64,6 +68,9 @@ class ScheduledSettings:
         self.mi_reward_weight = value_at(
             self._music.mi_reward_weight, *time, followed.get(names.MI_REWARD_WEIGHT)
         )
+        self.intrinsic_weight = value_at(
+            self._intrinsic.weight, *time, followed.get(names.INTRINSIC_WEIGHT)
+        )
         self.alpha = alpha_at(tac, self.entropic_index, *time, self._actions)
 
     def observe(self, quantity: Quantity, measured: float, env_steps: int | None = None) -> None:
@@ -79,11 +86,10 @@ class ScheduledSettings:
             for name, measured in self._followed.items()
             if measured is not None
         }
-        return {
-            names.ENTROPIC_INDEX: self.entropic_index,
-            names.MI_REWARD_WEIGHT: self.mi_reward_weight,
-            **followed,
-        }
+        weights = {names.MI_REWARD_WEIGHT: self.mi_reward_weight}
+        if self._intrinsic.reward is not None:
+            weights[names.INTRINSIC_WEIGHT] = self.intrinsic_weight
+        return {names.ENTROPIC_INDEX: self.entropic_index, **weights, **followed}
 
     def state(self) -> dict[str, Any]:
         """The state for a checkpoint; fresh episodes are measured with the last update's values."""

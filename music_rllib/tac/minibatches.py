@@ -5,9 +5,10 @@ A call of K updates has K concatenated minibatches:
 - module `default_policy`: OBS [K*B, I], ACTIONS [K*B, A], REWARDS [K*B] of the task, "discounts"
   [K*B], NEXT_OBS [K*B, I], and "weights" [K*B] with prioritized replay. The Learner adds the
   policy's "noise" [K*B, A], "next_noise" with averaged critics, and "target_critics" [K*N] with
-  `target_critics`.
+  `target_critics`. An intrinsic reward by episode adds "stored" [K*B].
 - module `mi_estimator`, if it is trained: OBS [K*N, T, D] whole trajectories, and "inside" [K*N, T]
   if they have unequal lengths
+- `INTRINSIC`, if an intrinsic reward needs them: the same; no module of RLlib has this name
 
 Shape legend: K updates, B transitions and N trajectories (or critics of targets) of one, T frames,
 I network inputs, D observation, A actions.
@@ -15,7 +16,7 @@ I network inputs, D observation, A actions.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -25,16 +26,28 @@ from ray.rllib.policy.sample_batch import MultiAgentBatch, SampleBatch
 from ray.rllib.utils.typing import ModuleID
 from torch import Tensor
 
-from music_rllib.intrinsic.interface import IntrinsicReward
-from music_rllib.replay.trajectories import Transitions, WholeTrajectories
-from music_rllib.tac.rl_module import ESTIMATOR_MODULE
+from music_rllib.intrinsic.music import Music
+from music_rllib.replay.trajectories import Floats, Transitions, WholeTrajectories
 
 Minibatch = dict[ModuleID, dict[str, Tensor]]
 """Columns by module."""
 
+STORED = "stored"
+"""Column of the numbers that the replay keeps for an intrinsic reward."""
+INTRINSIC = "intrinsic"
+"""The networks of an intrinsic reward, and the part of a batch with its trajectories."""
 
-def batch_of(drawn: Transitions, whole: WholeTrajectories | None) -> MultiAgentBatch:
-    """The argument of `Learner.update`; `whole` is the estimator's part, if it is trained."""
+
+def batch_of(
+    drawn: Transitions, whole: Mapping[ModuleID, WholeTrajectories], stored: Floats | None = None
+) -> MultiAgentBatch:
+    """The argument of `Learner.update`.
+
+    Args:
+        drawn: [K*B] transitions.
+        whole: [K*N] trajectories, of the estimator and of an intrinsic reward.
+        stored: [K*B] numbers that the replay keeps for an intrinsic reward.
+    """
     columns: dict[str, Any] = {
         Columns.OBS: drawn.inputs,
         Columns.ACTIONS: drawn.actions,
@@ -44,12 +57,14 @@ def batch_of(drawn: Transitions, whole: WholeTrajectories | None) -> MultiAgentB
     }
     if drawn.weights is not None:
         columns["weights"] = drawn.weights
+    if stored is not None:
+        columns[STORED] = stored
     batches = {DEFAULT_MODULE_ID: SampleBatch(columns)}
-    if whole is not None:
-        trajectories: dict[str, Any] = {Columns.OBS: whole.observations}
-        if whole.inside is not None:
-            trajectories["inside"] = whole.inside
-        batches[ESTIMATOR_MODULE] = SampleBatch(trajectories)
+    for module, one in whole.items():
+        trajectories: dict[str, Any] = {Columns.OBS: one.observations}
+        if one.inside is not None:
+            trajectories["inside"] = one.inside
+        batches[module] = SampleBatch(trajectories)
     return MultiAgentBatch(batches, env_steps=len(drawn.rewards))
 
 
@@ -59,7 +74,7 @@ class Minibatches(NamedTuple):
     columns: Minibatch
     """[K*B, ...] transitions of the policy's module, [K*N, ...] of the estimator's."""
     drawn: Sequence[Hashable]
-    """[K] values drawn by the intrinsic reward."""
+    """[K] values drawn by MUSIC."""
 
     @property
     def updates(self) -> int:
@@ -88,7 +103,7 @@ class Minibatches(NamedTuple):
             policy[Columns.OBS].unflatten(0, shape), policy[Columns.NEXT_OBS].unflatten(0, shape)
         )  # fmt: skip
 
-    def intrinsic_rewards(self, reward: IntrinsicReward) -> Tensor:
+    def music_rewards(self, music: Music) -> Tensor:
         """[K, B] rewards of fixed networks; equal drawn values are computed at once."""
         states, followers = self.transitions
         rewards: Tensor = states.new_empty(states.shape[:2])
@@ -98,6 +113,6 @@ class Minibatches(NamedTuple):
             if len(kinds) > 1:
                 alike = torch.tensor([k for k, other in enumerate(self.drawn) if other == drawn])
             before, after = (values[alike].flatten(0, 1) for values in (states, followers))
-            found = reward.reward(before, after, drawn)
+            found = music.reward(before, after, drawn)
             rewards[alike] = found.unflatten(0, (-1, states.shape[1]))
         return rewards

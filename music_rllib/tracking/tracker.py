@@ -358,7 +358,7 @@ class MlflowListener(Listener):
 
     def started(self, node: Node) -> None:
         """Start the node's MLflow run, or continue an earlier one."""
-        self.tracker.start(run_info(node, self._environments.get(node.run.task.name)))
+        self.tracker.start(run_info(node, self._environments.get(node.run.code)))
 
     def reported(self, node: Node, reports: list[Report]) -> None:
         """Log metrics with their original time, so that repeats are identical."""

@@ -21,6 +21,7 @@ from music_rllib.intrinsic.music import HELD_OUT_STEPS
 from music_rllib.kernels.compiling import is_kept
 from music_rllib.kernels.update import learn
 from music_rllib.replay.ring import Segment, new_segments
+from music_rllib.schedules import extremes
 from music_rllib.store.handoff import Spaces
 from music_rllib.store.history import Report
 from music_rllib.store.serialization import read_arrays, read_state, write_arrays, write_state
@@ -59,7 +60,7 @@ def algorithm_config(run: RunSettings) -> TACConfig:
         agent_indices=run.task.agent_indices, surrounding_indices=run.task.surrounding_indices
     )
     tac = run.tac.model_copy(update={"max_episode_steps": steps})
-    config.use(AlgorithmSettings(tac, run.music, run.replay, split))
+    config.use(AlgorithmSettings(tac, run.music, run.replay, split, run.intrinsic))
     config.training(total_env_steps=run.env_steps)
     config.replay(moved_distance=run.task.moved_distance)
     config.success_key, config.success_if_missing = run.task.success_key, False
@@ -248,6 +249,8 @@ class TrainingRun:
         if task_reward is None and run.music.task_reward:
             return None  # the reachable returns are not known
         reward = reward_of_step(Range(*(task_reward or (0.0, 0.0))), run.music)
+        if run.intrinsic.reward is not None:
+            reward = Range(reward.low - extremes(run.intrinsic.weight)[1], reward.high)
         metrics = [report.metrics for report in reports]
         means = np.array([one.get(names.Q_MEAN, 0.0) for one in metrics])
         bonuses = np.array(

@@ -134,8 +134,9 @@ class RunStorage:
             EnvironmentChangedError: They differ.
             ImportError: The environment is not installed here.
         """
-        task, driver = self._job.run.task, self._job.environment
-        self._environment = fingerprint_of(task.env_id, task.env_kwargs)
+        run, driver = self._job.run, self._job.environment
+        task = run.task
+        self._environment = fingerprint_of(task.env_id, task.env_kwargs, run.own_modules)
         if driver is not None and (other := on_another_machine(driver, self._environment)):
             raise EnvironmentChangedError(
                 f"the environment of {task.name} must be the same on every machine, on "

@@ -17,6 +17,7 @@ _WITHOUT_COST: dict[str, bool | set[str]] = {
     "tac": {"entropic_index", "alpha", "gamma", "tau", "lr", "target_bounds"}
     | {"random_steps", "random_actions", "warmup_steps"},
     "music": {"mi_reward_weight", "lr"},
+    "intrinsic": {"weight", "lr"},
 }
 """Settings that do not change how long a step takes."""
 

@@ -36,6 +36,7 @@ from tests.integration.algorithm.test_tac_losses import (
     learner,
     minibatch,
 )
+from tests.unit.intrinsic.test_rewards import OF_TRAJECTORIES
 
 DDPG = {
     "policy": "deterministic",
@@ -90,6 +91,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
         "dropped_quantiles": 1,
         "policy_delay": 2,
     },
+    "bonus": {**HER, "intrinsic.reward": "icm"},
+    "bonus on trajectories": {"music": MUSIC_U, "intrinsic.reward": OF_TRAJECTORIES},
     "widths between bounds": {"log_std_form": "tanh", "log_std_bounds": (-5.0, 2.0)},
 }
 ACTIVE_BOUNDS = {"target_bounds": (-0.5, 0.5), "log_std_bounds": (-0.02, 0.02)}

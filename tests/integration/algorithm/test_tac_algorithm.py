@@ -21,7 +21,7 @@ from music_rllib.config.tac_settings import TACSettings
 from music_rllib.envs.make import make_env
 from music_rllib.envs.values import BadNumberError
 from music_rllib.intrinsic.music import HELD_OUT_STEPS
-from music_rllib.intrinsic.settings import MusicSettings
+from music_rllib.intrinsic.settings import IntrinsicSettings, MusicSettings
 from music_rllib.replay.trajectories import Trajectory
 from music_rllib.tac.algorithm import TAC
 from music_rllib.tac.rl_module import TACModule
@@ -79,6 +79,8 @@ def build(
         if name.startswith("replay.")
     }
     config = TACConfig().environment(task)
+    for name in [name for name in settings if name.startswith("intrinsic.")]:
+        config.intrinsic(**{name.removeprefix("intrinsic."): settings.pop(name)})
     config.env_runners(
         num_envs_per_env_runner=2, num_env_runners=(where or {}).get("num_env_runners", 0)
     )
@@ -192,6 +194,7 @@ DDPG: dict[str, Any] = {
 }
 ANNEALED = {"schedule": "linear", "start": 0.4, "end": 1.0}
 PER: dict[str, Any] = {"replay.priority": "td_error", "replay.importance_exponent": ANNEALED}
+RND = {"intrinsic.reward": "rnd"}
 
 # A changed value for every setting, and other settings that both compared runs need.
 CHANGES: dict[str, tuple[Any, dict[str, Any]]] = {
@@ -241,6 +244,11 @@ CHANGES: dict[str, tuple[Any, dict[str, Any]]] = {
     "music.batch_trajectories": (8, {}),
     "music.prioritise_replay": (True, {}),
     "music.estimator": ("frozen", {}),
+    "intrinsic.reward": ("random", {}),
+    "intrinsic.weight": (0.3, RND),
+    "intrinsic.lr": (1e-2, RND),
+    "intrinsic.settings": ({"hidden": 16}, RND),
+    "intrinsic.frozen": (True, RND),
 }
 
 
@@ -266,6 +274,7 @@ def test_every_setting_is_listed() -> None:
     fields = set(TACSettings.model_fields)
     fields |= {f"music.{name}" for name in MusicSettings.model_fields}
     fields |= {f"replay.{name}" for name in ReplaySettings.model_fields}
+    fields |= {f"intrinsic.{name}" for name in IntrinsicSettings.model_fields}
     assert fields == set(CHANGES)
 
 
@@ -289,10 +298,10 @@ REDQ: dict[str, Any] = {
 
 @pytest.mark.parametrize(
     "settings",
-    [DDPG, {"bootstrap": "critics"}, PER, REDQ],
-    ids=["ddpg", "sac", "per", "drawn quantile critics, delayed policy"],
+    [DDPG, {"bootstrap": "critics"}, PER, REDQ, {"intrinsic.reward": "e3b"}],
+    ids=["ddpg", "sac", "per", "drawn quantile critics, delayed policy", "e3b"],
 )
-def test_other_backbones_and_per_resume_exactly_too(
+def test_other_backbones_and_rewards_resume_exactly_too(
     settings: dict[str, Any], tmp_path: Path
 ) -> None:
     unbroken = build(**HER, **settings)

@@ -1,0 +1,176 @@
+"""Trains an intrinsic reward's networks beside the policy, and makes it from its name.
+
+Shape legend: K updates of a call, B transitions of one.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from music_rllib import names
+from music_rllib.envs.tasks import make_importable
+from music_rllib.intrinsic.interface import Batch, IntrinsicReward, Sizes
+from music_rllib.intrinsic.settings import BUILT_IN, IntrinsicSettings
+from music_rllib.kernels.adam import FusedAdam
+from music_rllib.replay.trajectories import Floats, Trajectory
+
+
+def reward_class(name: str) -> type[IntrinsicReward]:
+    """The class of a built-in reward, or of a user's `module:Class`, whose module is imported.
+
+    Raises:
+        ValueError: The module cannot be imported, or has no such class.
+    """
+    module, _, attribute = BUILT_IN.get(name, name).partition(":")
+    try:
+        if name not in BUILT_IN:
+            make_importable(module)
+        found = getattr(importlib.import_module(module), attribute, None)
+    except ImportError as error:
+        raise ValueError(f"intrinsic.reward must be importable, got {name!r}: {error}") from error
+    if not (isinstance(found, type) and issubclass(found, IntrinsicReward)):
+        raise ValueError(
+            f"intrinsic.reward must name a subclass of IntrinsicReward in {module}, got {name!r}"
+        )
+    return found
+
+
+def make_reward(settings: IntrinsicSettings, sizes: Sizes, seed: int) -> IntrinsicReward:
+    """A reward with initial weights that depend on the seed only.
+
+    Raises:
+        ValueError: The class, its settings or the environment do not fit.
+    """
+    assert settings.reward is not None
+    kind = reward_class(settings.reward)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        try:
+            return kind(sizes, **settings.settings)
+        except TypeError as error:
+            raise ValueError(f"intrinsic.settings must fit {settings.reward}: {error}") from error
+
+
+class RewardLearner:
+    """Rewards of minibatches, each followed by one step of the reward's networks.
+
+    Args:
+        reward: on its device.
+        lr: Adam's step size.
+        frozen: do not train the networks.
+    """
+
+    def __init__(self, reward: IntrinsicReward, lr: float, *, frozen: bool) -> None:
+        self.reward, self._frozen = reward, frozen
+        self._parameters = [each for each in reward.parameters() if each.requires_grad]
+        self._adam = FusedAdam(self._parameters, lr) if self._parameters and not frozen else None
+
+    def batch(
+        self, inputs: Tensor, actions: Tensor, next_inputs: Tensor, generator: torch.Generator,
+        stored: Tensor | None = None, trajectories: Mapping[str, Tensor] | None = None,
+    ) -> Batch:  # fmt: skip
+        """The transitions of observations and goals [K*B, D + G], and of K*N trajectories."""
+        width, whole = self.reward.sizes.observation, trajectories or {}
+        return Batch(
+            inputs[:, :width], actions, next_inputs[:, :width], inputs[:, width:], generator,
+            stored, whole.get("obs"), whole.get("inside"),
+        )  # fmt: skip
+
+    def values_of(self, episodes: Sequence[Trajectory]) -> list[Floats]:
+        """[n] numbers of each episode for the replay, with `by_episode`."""
+        width, device = self.reward.sizes.observation, self.reward.sums.device
+        found = []
+        for episode in episodes:
+            arrays = (episode.frames[:, :width], episode.actions)
+            with torch.no_grad():
+                values = self.reward.of_episode(*(torch.tensor(a, device=device) for a in arrays))
+            found.append(values.cpu().numpy())
+        return found
+
+    def observe(self, batch: Batch, episodes: Sequence[Trajectory]) -> Tensor:
+        """[steps] reward of fresh episodes, whose transitions are the batch."""
+        if self.reward.by_episode:
+            stored = torch.from_numpy(np.concatenate(self.values_of(episodes)))
+            batch = batch._replace(stored=stored.to(batch.states.device))
+        return self.reward.reward(batch, learning=False)[0]
+
+    def learn(self, batch: Batch, updates: int) -> tuple[Tensor, dict[str, Tensor]]:
+        """K updates on K concatenated minibatches.
+
+        Returns:
+            [K, B] rewards in [-1, 0], each minibatch's before its update, and metrics [K] by name.
+        """
+        rewards, history = [], []
+        for k in range(updates):
+            part = _part(batch, k, updates)
+            reward, bonus = self.reward.reward(part, learning=not self._frozen)
+            rewards.append(reward)
+            metrics = {names.INTRINSIC_REWARD: reward.mean(), names.INTRINSIC_BONUS: bonus.mean()}
+            if self._adam is not None:
+                metrics |= self._step(part, self._adam)
+            history.append(metrics)
+        stacked = {name: torch.stack([each[name] for each in history]) for name in history[0]}
+        return torch.stack(rewards), stacked
+
+    def _step(self, batch: Batch, adam: FusedAdam) -> dict[str, Tensor]:
+        with torch.enable_grad():
+            loss = self.reward.loss(batch)
+        if loss is None:
+            return {}
+        gradients = torch.autograd.grad(loss, self._parameters, allow_unused=True)
+        for parameter, gradient in zip(self._parameters, gradients, strict=True):
+            parameter.grad = gradient
+        adam.step()
+        return {names.INTRINSIC_LOSS: loss.detach()}
+
+    # -- state ------------------------------------------------------------------------------------
+
+    def weights(self) -> dict[str, NDArray[Any]]:
+        """Copies of the parameters and buffers, by name."""
+        return {
+            name: tensor.detach().cpu().numpy().copy()
+            for name, tensor in self.reward.state_dict().items()
+        }
+
+    def load_weights(self, weights: Mapping[str, NDArray[Any]]) -> None:
+        """Set all parameters and buffers."""
+        tensors = {name: torch.tensor(np.asarray(array)) for name, array in weights.items()}
+        self.reward.load_state_dict(tensors)
+
+    def state(self) -> dict[str, Any]:
+        """The state for a checkpoint."""
+        moments = self._adam.state_dict()["state"] if self._adam is not None else {}
+        return {
+            "weights": self.weights(),
+            "adam": {
+                index: {name: value.cpu().numpy().copy() for name, value in of_one.items()}
+                for index, of_one in moments.items()
+            },
+        }
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Continue from a result of `state`."""
+        self.load_weights(state["weights"])
+        if self._adam is not None:
+            moments = {
+                int(index): {name: torch.tensor(value) for name, value in of_one.items()}
+                for index, of_one in state["adam"].items()
+            }
+            groups = self._adam.state_dict()["param_groups"]
+            self._adam.load_state_dict({"state": moments, "param_groups": groups})
+
+
+def _part(batch: Batch, k: int, updates: int) -> Batch:
+    """The minibatch of update k of K."""
+
+    def rows(values: Any) -> Any:
+        return values.tensor_split(updates)[k] if isinstance(values, Tensor) else values
+
+    return batch if updates == 1 else Batch(*map(rows, batch))

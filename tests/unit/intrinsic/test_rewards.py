@@ -1,0 +1,229 @@
+"""Intrinsic rewards other than MUSIC's: an oracle for each, their scale, exact resume."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from music_rllib.intrinsic.interface import Batch, IntrinsicReward, Sizes
+from music_rllib.intrinsic.relabeling import RewardLearner, make_reward, reward_class
+from music_rllib.intrinsic.settings import BUILT_IN, IntrinsicSettings
+from music_rllib.store.serialization import read_state, write_state
+
+SIZES = Sizes(6, 3, 2, (0, 1, 2), (3, 4, 5))
+
+
+class Speed(IntrinsicReward):
+    """An own reward, named `tests.unit.intrinsic.test_rewards:Speed` in YAML."""
+
+    def __init__(self, sizes: Sizes, *, factor: float = 1.0) -> None:
+        super().__init__(sizes)
+        self.factor = factor
+
+    def bonus(self, batch: Batch) -> Tensor:
+        return self.factor * (batch.followers - batch.states).abs().sum(-1)
+
+
+class Unusual(IntrinsicReward):
+    """Distance to the mean of all trajectories."""
+
+    trajectories = 3
+
+    def __init__(self, sizes: Sizes) -> None:
+        super().__init__(sizes)
+        self.center = torch.nn.Parameter(torch.zeros(sizes.observation))
+
+    def bonus(self, batch: Batch) -> Tensor:
+        return (batch.followers - self.center).abs().sum(-1)
+
+    def loss(self, batch: Batch) -> Tensor:
+        assert batch.trajectories is not None
+        assert batch.trajectories.shape[::2] == (3, self.sizes.observation)
+        return (batch.trajectories - self.center).square().mean()
+
+
+OWN, OF_TRAJECTORIES = f"{__name__}:Speed", f"{__name__}:Unusual"
+
+
+def made(name: str, *, frozen: bool = False, seed: int = 0, **settings: Any) -> RewardLearner:
+    chosen = IntrinsicSettings(reward=name, settings=settings, frozen=frozen, lr=1e-2)
+    return RewardLearner(make_reward(chosen, SIZES, seed), chosen.lr, frozen=frozen)
+
+
+def batch(rows: int = 64, seed: int = 0, **columns: Any) -> Batch:
+    generator = torch.Generator().manual_seed(seed)
+    states, followers = torch.randn(2, rows, 6, generator=generator)
+    actions = torch.rand(rows, 2, generator=generator) * 2 - 1
+    goals, stored = torch.randn(rows, 3, generator=generator), torch.ones(rows)
+    return Batch(states, actions, followers, goals, generator, stored)._replace(**columns)
+
+
+@torch.no_grad()
+def bonus(learner: RewardLearner, of: Batch) -> float:
+    return float(learner.reward.bonus(of).mean())
+
+
+def test_rnd_falls_on_repeated_states_only() -> None:
+    rnd, seen = made("rnd"), batch()
+    new = batch(seed=1, followers=batch(seed=1).followers + 3.0)
+    before = bonus(rnd, seen)
+    for _ in range(200):
+        rnd.learn(seen, 1)
+    assert bonus(rnd, seen) < 0.05 * before
+    assert bonus(rnd, new) > 10 * bonus(rnd, seen)
+
+
+def moved(seed: int, *, noise: float = 0.0) -> Batch:
+    """Dynamics in which the action moves the first two dimensions."""
+    one = batch(256, seed)
+    step = torch.nn.functional.pad(one.actions, (0, 4))
+    return one._replace(followers=one.states + step + noise * one.followers)
+
+
+@pytest.mark.parametrize("name", ["icm", "disagreement"])
+def test_the_bonus_of_predictable_dynamics_vanishes(name: str) -> None:
+    learner = made(name)
+    learner.reward.inputs.update(moved(1).states)  # type: ignore[operator,union-attr]
+    before = bonus(learner, moved(999))
+    for seed in range(400):
+        learner.learn(moved(seed), 1)
+    assert bonus(learner, moved(999)) < 0.1 * before
+    assert bonus(learner, moved(999)._replace(states=moved(999).states * 4)) > 5 * bonus(
+        learner, moved(999)
+    )
+
+
+def test_icm_stays_high_for_unpredictable_dynamics() -> None:
+    found = {}
+    for noise in (0.0, 1.0):
+        learner = made("icm")
+        for seed in range(300):
+            learner.learn(moved(seed, noise=noise), 1)
+        found[noise] = bonus(learner, moved(999, noise=noise))
+    assert found[1.0] > 5 * found[0.0]
+
+
+def test_e3b_equals_its_closed_form() -> None:
+    e3b = made("e3b", ridge=0.5).reward
+    frames, actions = torch.randn(9, 6), torch.randn(8, 2)
+    found = e3b.of_episode(frames, actions).double()
+    features = e3b.encode(frames).detach().double()  # type: ignore[operator]
+    for t in range(8):
+        so_far = features[: t + 1]
+        inverse = torch.linalg.inv(so_far.T @ so_far + 0.5 * torch.eye(16).double())
+        expected = features[t + 1] @ inverse @ features[t + 1]
+        assert float(found[t]) == pytest.approx(float(expected), rel=1e-3)
+    twice = e3b.of_episode(frames.repeat(2, 1), torch.cat([actions, actions, actions[:1]]))
+    assert float(twice[9:].mean()) < 0.6 * float(twice[:8].mean())
+
+
+def test_diayn_separates_two_trivial_skills() -> None:
+    diayn = made("diayn", skills=2)
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(200):
+        goals = torch.randn(64, 3, generator=generator)
+        diayn.reward.update_scales(batch(goals=goals))  # type: ignore[operator]
+        skill = diayn.reward.skills(goals)  # type: ignore[operator]
+        followers = torch.randn(64, 6, generator=generator)
+        followers[:, 0] += 8.0 * skill - 4.0
+        told = batch(goals=goals, followers=followers)
+        diayn.learn(told, 1)
+    assert bonus(diayn, told) > 0.85
+    assert bonus(diayn, told._replace(followers=followers.flip(0))) < 0.65
+    assert bonus(diayn, told._replace(followers=-followers)) < 0.1
+
+
+def test_discern_recognises_its_goal() -> None:
+    discern = made("discern")
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(300):
+        goals = torch.randn(64, 3, generator=generator)
+        followers = torch.randn(64, 6, generator=generator)
+        followers[:, 3:] = goals + 0.02 * torch.randn(64, 3, generator=generator)
+        told = batch(goals=goals, followers=followers)
+        discern.learn(told, 1)
+    assert bonus(discern, told) > 0.5
+    assert bonus(discern, told._replace(goals=goals.roll(1, 0))) < 0.2
+
+
+def test_displacement_is_of_the_object_and_jitter_earns_nothing() -> None:
+    learner, one = made("displacement"), batch()
+    arm = one._replace(followers=torch.cat([one.followers[:, :3], one.states[:, 3:]], 1))
+    assert bonus(learner, arm) == 0
+    rewards, _ = learner.learn(arm._replace(followers=arm.followers + 1e-5), 1)
+    assert float(rewards.max()) < -0.98
+    distance = (one.followers - one.states)[:, 3:].norm(dim=1)
+    torch.testing.assert_close(learner.reward.bonus(one), distance)
+    with pytest.raises(ValueError, match="without surrounding_indices"):
+        make_reward(IntrinsicSettings(reward="displacement"), Sizes(6, 3, 2), 0)
+
+
+def test_random_rewards_are_uniform_and_of_no_transition() -> None:
+    rewards, _ = made("random").learn(batch(4096), 1)
+    assert float(rewards.mean()) == pytest.approx(-0.5, abs=0.03)
+    assert float(rewards.std()) == pytest.approx(1 / math.sqrt(12), abs=0.02)
+
+
+@pytest.mark.parametrize("factor", [1e-6, 1.0, 1e6])
+def test_rewards_have_the_same_scale_for_any_unit_of_the_bonus(factor: float) -> None:
+    rewards, metrics = made(OWN, factor=factor).learn(batch(256), 2)
+    expected, _ = made(OWN).learn(batch(256), 2)
+    torch.testing.assert_close(rewards, expected)
+    assert rewards.shape == (2, 128)
+    assert -0.7 < float(rewards.mean()) < -0.3
+    assert metrics["intrinsic/bonus"].shape == (2,)
+
+
+@pytest.mark.parametrize("name", [*BUILT_IN, OWN])
+def test_rewards_resume_exactly_and_are_in_their_range(name: str, tmp_path: Path) -> None:
+    unbroken, resumed = made(name), made(name, seed=1)
+    for seed in range(3):
+        unbroken.learn(batch(seed=seed), 2)
+    write_state(tmp_path, unbroken.state())
+    resumed.load_state(read_state(tmp_path))
+    for seed in range(3, 6):
+        rewards, metrics = unbroken.learn(batch(seed=seed), 2)
+        theirs, their_metrics = resumed.learn(batch(seed=seed), 2)
+        assert torch.equal(rewards, theirs)
+        assert all(torch.equal(metrics[key], value) for key, value in their_metrics.items())
+        assert ((rewards >= -1.0) & (rewards <= 0.0)).all()
+    for key, array in unbroken.weights().items():
+        assert (array == resumed.weights()[key]).all(), key
+
+
+@pytest.mark.parametrize("name", ["rnd", "icm", "diayn"])
+def test_frozen_rewards_keep_the_networks_and_the_scale_of_their_source(name: str) -> None:
+    source, frozen = made(name), made(name, seed=1, frozen=True)
+    source.learn(batch(), 1)
+    frozen.load_weights(source.weights())
+    first, _ = frozen.learn(batch(seed=1), 1)
+    for seed in range(5):
+        frozen.learn(batch(seed=seed), 1)
+    assert torch.equal(frozen.learn(batch(seed=1), 1)[0], first)
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "message"),
+    [
+        ("no_such_module:Mine", {}, r"^intrinsic\.reward must be importable, got 'no_such"),
+        (f"{__name__}:batch", {}, "must name a subclass of IntrinsicReward"),
+        ("rnd", {"hiden": 3}, r"^intrinsic\.settings must fit rnd: .*hiden"),
+        ("diayn", {"skills": 1}, r"^intrinsic\.settings\.skills must be >= 2, got 1"),
+    ],
+)
+def test_what_does_not_fit_is_named(name: str, settings: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        made(name, **settings)
+
+
+def test_a_bonus_of_another_shape_is_refused_instead_of_broadcast() -> None:
+    class Column(Speed):
+        def bonus(self, batch: Batch) -> Tensor:
+            return super().bonus(batch).unsqueeze(1)
+
+    with pytest.raises(ValueError, match=r"of shape \(64,\), got shape \(64, 1\)"):
+        RewardLearner(Column(SIZES), 1e-3, frozen=False).learn(batch(), 1)
+    assert reward_class(OWN).__name__ == "Speed"
