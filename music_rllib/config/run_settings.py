@@ -130,6 +130,7 @@ YOUNGER: tuple[tuple[str, str], ...] = (
     ("tac", "critics"), ("tac", "target_critics"), ("tac", "policy_delay"),
     ("tac", "quantiles"), ("tac", "dropped_quantiles"),
     ("tac", "random_actions"), ("replay", "hindsight_goals"), ("replay", "n_steps"),
+    ("music", "bound"),
 )  # fmt: skip
 """Group and name of settings that are newer than the node keys of finished runs."""
 
@@ -242,6 +243,7 @@ class RunSettings(StrictModel):
             bootstrap=self.tac.bootstrap,
             normalise_observations=self.tac.normalise_observations,
             estimator_hidden_size=self.music.hidden_size,
+            estimator_bound=self.music.bound,
             log_std_form=self.tac.log_std_form,
             log_std_bounds=self.tac.log_std_bounds if self.tac.log_std_form == "tanh" else None,
             intrinsic=self.intrinsic.reward and self.intrinsic.identity,

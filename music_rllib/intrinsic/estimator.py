@@ -7,13 +7,21 @@ from 0.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import softplus
 
-from music_rllib.functional.mutual_information import donsker_varadhan, of_draw, shuffle_time
+from music_rllib.functional.mutual_information import (
+    donsker_varadhan,
+    of_draw,
+    other_bound,
+    shifted,
+    shuffle_time,
+)
 from music_rllib.kernels.adam import FlatParameters, FusedAdam
 from music_rllib.kernels.mutual_information import Data, Weights, bounds, learn
 
@@ -22,8 +30,14 @@ FAR = 10.0
 are then 1 or all are -1, and the bound stays 0. Fetch's inputs are below 2."""
 
 
+NEGATIVES = 8
+"""InfoNCE: shuffled pairs for each pair of one time."""
+AVERAGE_RATE = 0.01
+"""Share of an update in the moving average of MINE."""
+
+
 class MutualInformationEstimator(nn.Module):
-    """T(x, y) = tanh(w . relu(Wx x + Wy y + b) + c).
+    """T(x, y) = tanh(w . relu(Wx x + Wy y + b) + c); without tanh for other bounds than `capped`.
 
     tanh keeps T in [-1, 1] and thus the bound below 2 nats. Inputs that are far from 0 are shifted
     and scaled first (`adapt_to`), which does not change the information between them.
@@ -32,6 +46,7 @@ class MutualInformationEstimator(nn.Module):
         agent_indices: X positions of the agent's state in an observation.
         surrounding_indices: Y positions of the surrounding state.
         hidden_size: hidden units.
+        bound: `capped`: Donsker-Varadhan; or a kind of `other_bound`.
     """
 
     agent_indices: Tensor
@@ -40,16 +55,23 @@ class MutualInformationEstimator(nn.Module):
     """[X + Y] subtracted from the inputs; 0 for raw inputs."""
     scale: Tensor
     """[X + Y] factor on the shifted inputs; 1 for raw inputs."""
+    log_average: Tensor
+    """[] logarithm of the moving average of exp T(x, y'), with the bound `moving_average`."""
     compiled = True
-    """Whether compiled code computes bounds without gradient on a CPU."""
+    """Whether compiled code computes bounds without gradient on a CPU; only `capped` ones."""
 
     def __init__(
         self,
         agent_indices: Sequence[int],
         surrounding_indices: Sequence[int],
         hidden_size: int = 128,
+        bound: str = "capped",
     ) -> None:
         super().__init__()
+        self.kind = bound
+        self.compiled = bound == "capped"
+        if bound == "moving_average":
+            self.register_buffer("log_average", torch.tensor(0.0))
         # Buffers move with the module's device; the indices are not part of its state.
         self.register_buffer("agent_indices", torch.tensor(agent_indices), persistent=False)
         surrounding = torch.tensor(surrounding_indices)
@@ -90,7 +112,8 @@ class MutualInformationEstimator(nn.Module):
         """[..., X], [..., Y] -> [...] statistics."""
         agent, surrounding = self._scaled(agent, surrounding)
         hidden = torch.relu(self.agent(agent) + self.surrounding(surrounding))
-        return torch.tanh(self.output(hidden)).squeeze(-1)
+        statistics: Tensor = self.output(hidden).squeeze(-1)
+        return torch.tanh(statistics) if self.kind == "capped" else statistics
 
     def _scaled(self, agent: Tensor, surrounding: Tensor) -> tuple[Tensor, Tensor]:
         if self._raw:
@@ -115,9 +138,46 @@ class MutualInformationEstimator(nn.Module):
             data = self.data(observations, permutations, inside)
             weights = Weights(*(parameter.detach().numpy() for parameter in self.parameters()))
             return torch.from_numpy(bounds(data, weights))
+        joint, marginals = self._statistics(observations, permutations, inside)
+        if self.kind == "capped":
+            return donsker_varadhan(joint, marginals[0], inside)
+        return other_bound(self.kind, joint, marginals, inside)
+
+    def _statistics(
+        self, observations: Tensor, permutations: Tensor, inside: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """[N, T] statistics of pairs of one time, and [R, N, T] of shuffled pairs."""
         agent, surrounding = self._halves(observations)
-        shuffled = shuffle_time(surrounding, permutations)
-        return donsker_varadhan(self(agent, surrounding), self(agent, shuffled), inside)
+        several = permutations.unsqueeze(0)
+        if self.kind == "infonce":
+            several = shifted(permutations, NEGATIVES, inside)
+        shuffled = torch.stack([shuffle_time(surrounding, each) for each in several])
+        return self(agent, surrounding), self(agent.expand(len(several), -1, -1, -1), shuffled)
+
+    def loss(
+        self, observations: Tensor, permutations: Tensor, inside: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """[] loss and [] mean bound of trajectories; arguments as for `bound`.
+
+        The loss is the negative mean bound. With `moving_average` it has the gradient of MINE, in
+        which a moving average over updates replaces the mean of exp T(x, y') in the denominator.
+        With `smile` it is that of the Jensen-Shannon divergence, as in the authors' code: the
+        clipped bound itself grows without limit.
+        """
+        if self.kind not in {"moving_average", "smile"}:
+            mean = self.bound(observations, permutations, inside).mean()
+            return -mean, mean.detach()
+        joint, marginals = self._statistics(observations, permutations, inside)
+        bound = other_bound(self.kind, joint, marginals, inside).mean().detach()
+        rows = slice(None) if inside is None else inside
+        joint, shuffled = joint[rows].flatten(), marginals[0][rows].flatten()
+        if self.kind == "smile":
+            return softplus(-joint).mean() + softplus(shuffled).mean(), bound
+        log_mean = shuffled.logsumexp(0) - math.log(len(shuffled))
+        with torch.no_grad():
+            kept = self.log_average + math.log1p(-AVERAGE_RATE)
+            self.log_average.copy_(torch.logaddexp(kept, log_mean + math.log(AVERAGE_RATE)))
+        return (log_mean - self.log_average).exp() - joint.mean(), bound
 
     def transition_bounds(
         self, states: Tensor, followers: Tensor, swapped: Sequence[bool] = (True,)

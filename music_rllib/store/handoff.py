@@ -58,6 +58,7 @@ class Architecture(_Strict):
     bootstrap: str
     normalise_observations: bool
     estimator_hidden_size: int
+    estimator_bound: str = "capped"
     log_std_form: str
     """Meaning of the policy's outputs."""
     log_std_bounds: tuple[float, float] | None
@@ -68,8 +69,12 @@ class Architecture(_Strict):
     def differences(self, other: Architecture, starts_from: str) -> list[str]:
         """Settings that prevent a run from starting from these weights, named as in YAML."""
         if starts_from == "estimator":
-            fits = self.estimator_hidden_size == other.estimator_hidden_size
-            return [] if fits else ["music.hidden_size"]
+            fields = {"estimator_hidden_size": "hidden_size", "estimator_bound": "bound"}
+            return [
+                f"music.{setting}"
+                for name, setting in fields.items()
+                if getattr(self, name) != getattr(other, name)
+            ]
         if starts_from == "intrinsic":
             names = ["intrinsic.reward and intrinsic.settings"]
             return [] if self.intrinsic == other.intrinsic else names

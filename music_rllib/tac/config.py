@@ -314,7 +314,11 @@ class TACConfigBase(AlgorithmConfig):
                 module_class=EstimatorModule,
                 observation_space=policy.observation_space,
                 action_space=policy.action_space,
-                model_config={**dict(self.settings.split), "hidden_size": music.hidden_size},
+                model_config={
+                    **dict(self.settings.split),
+                    "hidden_size": music.hidden_size,
+                    "bound": music.bound,
+                },
                 learner_only=True,
             )
             spec.add_modules({ESTIMATOR_MODULE: estimator})

@@ -65,6 +65,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "music-r": {"music": MUSIC_R, "entropic_index": 1.5},
     "episodes of unequal lengths": {"task": "Uneven", "music": MUSIC_U},
     "frames shuffled as in 2021": {"music": {**MUSIC_U, "shuffle": "random"}},
+    "MINE": {"music": {**MUSIC_U, "bound": "moving_average"}},
     "q measured, alpha scheduled": {"entropic_index": BY_ENTROPY, "alpha": {**RAMP, "start": 0.1}},
     "alpha learned": {"alpha": {"learned": True}, "bootstrap": "critics"},
     "ddpg": {

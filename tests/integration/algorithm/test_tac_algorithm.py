@@ -238,6 +238,7 @@ CHANGES: dict[str, tuple[Any, dict[str, Any]]] = {
     "music.task_reward": (False, {}),
     "music.goals": ("zero", {"replay.hindsight_k": 0.0}),
     "music.reward_scale": (50.0, {}),
+    "music.bound": ("infonce", {}),
     "music.shuffle": ("random", {}),
     "music.hidden_size": (16, {}),
     "music.lr": (1e-2, {}),

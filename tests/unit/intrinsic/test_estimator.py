@@ -10,6 +10,7 @@ from torch import Tensor
 from benchmarks.gaussians import capped_optimum, trained_bound, true_information
 from music_rllib.functional.mutual_information import (
     donsker_varadhan,
+    other_bound,
     shuffle_time,
     time_permutations,
 )
@@ -45,6 +46,39 @@ def test_bound_approaches_what_the_cap_allows_and_never_exceeds_the_truth(
     bound = trained_bound(rho, dims, seed=0)
     # 0.01: the sampling error of 160,000 held-out pairs, three standard deviations.
     assert 0.9 * capped_optimum(rho, dims) < bound < min(truth, 2.0) + 0.01
+
+
+@pytest.mark.parametrize("bound", ["moving_average", "nwj", "smile", "infonce"])
+def test_bounds_without_a_cap_approach_the_truth(bound: str) -> None:
+    truth = true_information(0.9, 1)
+    found = trained_bound(0.9, 1, seed=0, steps=150, bound=bound)
+    # InfoNCE of 9 pairs is far below ln 9 = 2.2 already.
+    assert (0.75 if bound == "infonce" else 0.94) * truth < found < truth + 0.02
+
+
+def test_bounds_without_a_cap_equal_their_formulas() -> None:
+    joint, marginals = torch.randn(3, 7).double(), torch.randn(2, 3, 7).double()
+    exp = marginals[0].exp()
+    expected = {
+        "moving_average": joint.mean(1) - exp.mean(1).log(),
+        "nwj": joint.mean(1) - exp.mean(1) / math.e,
+        "smile": joint.mean(1) - exp.clamp(math.exp(-5), math.exp(5)).mean(1).log(),
+        "infonce": (joint - ((joint.exp() + marginals.exp().sum(0)) / 3).log()).mean(1),
+    }
+    padding = torch.full((3, 4), 9.0).double()
+    inside = torch.arange(11).expand(3, 11) < 7
+    for kind, values in expected.items():
+        torch.testing.assert_close(other_bound(kind, joint, marginals), values)
+        padded = torch.cat([joint, padding], 1), torch.cat([marginals, padding.expand(2, 3, 4)], 2)
+        torch.testing.assert_close(other_bound(kind, *padded, inside), values)
+
+
+@pytest.mark.parametrize("bound", ["moving_average", "nwj", "smile", "infonce"])
+def test_transitions_at_rest_earn_the_smallest_reward_with_every_bound(bound: str) -> None:
+    estimator = MutualInformationEstimator(range(3), range(3, 6), bound=bound)
+    x, y = torch.randn(10, 2, 3), torch.randn(10, 1, 3).expand(10, 2, 3)
+    with torch.no_grad():
+        assert (transition_bounds(estimator, x, y) <= 1e-6).all()
 
 
 def test_bound_of_independent_inputs_is_zero() -> None:
