@@ -69,12 +69,9 @@ class Architecture(_Strict):
     def differences(self, other: Architecture, starts_from: str) -> list[str]:
         """Settings that prevent a run from starting from these weights, named as in YAML."""
         if starts_from == "estimator":
-            fields = {"estimator_hidden_size": "hidden_size", "estimator_bound": "bound"}
-            return [
-                f"music.{setting}"
-                for name, setting in fields.items()
-                if getattr(self, name) != getattr(other, name)
-            ]
+            prefix, known = "estimator_", ("estimator_hidden_size", "estimator_bound")
+            wrong = (name for name in known if getattr(self, name) != getattr(other, name))
+            return [f"music.{name.removeprefix(prefix)}" for name in wrong]
         if starts_from == "intrinsic":
             names = ["intrinsic.reward and intrinsic.settings"]
             return [] if self.intrinsic == other.intrinsic else names

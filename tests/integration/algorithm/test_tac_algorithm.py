@@ -435,7 +435,7 @@ def test_the_bound_on_fresh_episodes_is_taken_over_all_of_them(tmp_path: Path) -
     assert abs(found["mutual_information/held_out_bound"]) < 0.5
     # Measurements that are not yet reported are part of the state.
     learner = algo.learner_group._learner
-    assert learner._intrinsic.metrics() == {}
+    assert learner._music.metrics() == {}
     held = algo.replay.packed(0)
     ends = np.cumsum([0, *steps])
     for i, (begin, end) in enumerate(itertools.pairwise(ends)):
@@ -443,9 +443,9 @@ def test_the_bound_on_fresh_episodes_is_taken_over_all_of_them(tmp_path: Path) -
         learner.diagnose([Trajectory(held["frames"][begin + i : end + i + 1], *columns)])
     algo.save_to_path(tmp_path / "checkpoint")
     resumed.restore_from_path(tmp_path / "checkpoint")
-    taken = learner._intrinsic.metrics()
+    taken = learner._music.metrics()
     assert taken[HELD_OUT_STEPS] == sum(n for n in steps if n > 1)
-    assert resumed.learner_group._learner._intrinsic.metrics() == taken
+    assert resumed.learner_group._learner._music.metrics() == taken
     assert fingerprint(resumed, 1) == fingerprint(algo, 1)
 
 

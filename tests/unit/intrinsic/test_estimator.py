@@ -51,9 +51,9 @@ def test_bound_approaches_what_the_cap_allows_and_never_exceeds_the_truth(
 @pytest.mark.parametrize("bound", ["moving_average", "nwj", "smile", "infonce"])
 def test_bounds_without_a_cap_approach_the_truth(bound: str) -> None:
     truth = true_information(0.9, 1)
-    found = trained_bound(0.9, 1, seed=0, steps=150, bound=bound)
-    # InfoNCE of 9 pairs is far below ln 9 = 2.2 already.
-    assert (0.75 if bound == "infonce" else 0.94) * truth < found < truth + 0.02
+    steps, share = (50, 0.7) if bound == "infonce" else (100, 0.93)  # with 9 pairs in place of all
+    found = trained_bound(0.9, 1, seed=0, steps=steps, bound=bound)
+    assert share * truth < found < truth + 0.02
 
 
 def test_bounds_without_a_cap_equal_their_formulas() -> None:

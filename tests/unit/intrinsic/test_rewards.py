@@ -100,7 +100,7 @@ def test_icm_stays_high_for_unpredictable_dynamics() -> None:
     found = {}
     for noise in (0.0, 1.0):
         learner = made("icm")
-        for seed in range(300):
+        for seed in range(150):
             learner.learn(moved(seed, noise=noise), 1)
         found[noise] = bonus(learner, moved(999, noise=noise))
     assert found[1.0] > 5 * found[0.0]
