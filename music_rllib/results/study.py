@@ -112,7 +112,8 @@ def study_of(
     without_test = len(untested)
     unplanned: list[Claim] = []
     if latest is not None and latest != plan:
-        known = plan.plan.hypotheses if plan and _same_test(plan, latest) else ()
+        tests = {(one.plan.metric, one.plan.margin) for one in (plan, latest) if one}
+        known = plan.plan.hypotheses if plan and len(tests) == 1 else ()
         unplanned += _of_plan(sweep, stages, latest, known, untested)
     means: list[Mean] = []
     if chosen is not None:
@@ -155,10 +156,6 @@ def _plan_before_results(sweep: Sweep, stages: Mapping[str, StageRuns]) -> PlanV
         if version.recorded_ms < first_result(sweep, runs):
             return version
     return None
-
-
-def _same_test(one: PlanVersion, other: PlanVersion) -> bool:
-    return (one.plan.metric, one.plan.margin) == (other.plan.metric, other.plan.margin)
 
 
 def _of_plan(

@@ -295,7 +295,9 @@ def find_or_create(
         determined_by: Plain data of everything else that determines the study's values.
         compared: The compared values of the study; empty in `search` mode.
     """
-    own = _own_settings(settings)
+    # Neither the number of trials nor the storage determines points and values.
+    excluded = {"trials", "final", "study", "storage", "compare", "mode"}
+    own = settings.model_dump(mode="json", by_alias=True, exclude=excluded)
     base = "/".join((base, *(f"{name}={short(value, name)}" for name, value in compared.items())))
     name = f"{base} @{content_key([own, {**determined_by, 'arm': dict(compared)}])}"
 
@@ -338,12 +340,6 @@ def fits(values: Mapping[str, Any], settings: SearchSettings) -> bool:
         if exists:
             seen[name] = values[name]
     return len(seen) == len(values)
-
-
-def _own_settings(settings: SearchSettings) -> dict[str, Any]:
-    """The settings that determine points and values: neither number of trials nor storage."""
-    excluded = {"trials", "final", "study", "storage", "compare", "mode"}
-    return settings.model_dump(mode="json", by_alias=True, exclude=excluded)
 
 
 def _set_attributes(storage: BaseStorage, study: int, attributes: Mapping[str, Any]) -> None:

@@ -242,7 +242,7 @@ def _against_entropy(sweep: Sweep, stage: StageRuns) -> Iterator[Drawing]:
             caption="One point for each finished run. If all q fall on one curve, entropy explains "
             "performance; if they differ at equal entropy, q itself matters.",
             subplots=tuple(filter(None, subplots)),
-            legend=_legend(by_q),
+            legend=[(f"q = {q}", style) for q, style in by_q.items()],
         )
 
 
@@ -251,10 +251,6 @@ def _styles_by_q(conditions: Sequence[Condition]) -> dict[str, Style]:
     indices = dict.fromkeys(condition.entropic_index for condition in conditions)
     alone = tuple(Condition(entropic_index=q, others=(), runs=()) for q in indices)
     return {one.entropic_index: style for one, style in styles_of(alone).items()}
-
-
-def _legend(by_q: Mapping[str, Style]) -> Legend:
-    return [(f"q = {q}", style) for q, style in by_q.items()]
 
 
 # The study --------------------------------------------------------------------------------------
