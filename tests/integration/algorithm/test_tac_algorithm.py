@@ -221,6 +221,7 @@ CHANGES: dict[str, tuple[Any, dict[str, Any]]] = {
     "batch_size": (48, {}),
     "replay_ratio": (0.5, {}),
     "random_steps": (200, {}),
+    "random_actions": ("wide", {}),
     "warmup_steps": (0, {}),
     "normalise_observations": (False, {}),
     "observation_clip": (0.5, {}),
@@ -231,6 +232,8 @@ CHANGES: dict[str, tuple[Any, dict[str, Any]]] = {
     "replay.capacity": (200, {}),
     "replay.hindsight_k": (1.0, {}),
     "replay.hindsight_episodes": ("moved", {}),
+    "replay.hindsight_goals": ("final", {}),
+    "replay.n_steps": (3, {"music.estimator": "none", "music.mi_reward_weight": 0.0}),
     "replay.priority": ("td_error", {}),
     "replay.priority_exponent": (1.0, PER),
     "replay.importance_exponent": (1.0, PER),
@@ -287,6 +290,10 @@ def test_no_setting_is_dead(setting: str, bases: dict[str, dict[str, float]]) ->
     assert last_weights({**base, setting: value}) != bases[repr(base)]
 
 
+NOISE_AND_STEPS: dict[str, Any] = {
+    "behaviour": {"kind": "colored_noise", "random_share": 0.3},
+    "replay.n_steps": 3,
+}
 REDQ: dict[str, Any] = {
     "bootstrap": "critics",
     "critics": 3,
@@ -299,8 +306,20 @@ REDQ: dict[str, Any] = {
 
 @pytest.mark.parametrize(
     "settings",
-    [DDPG, {"bootstrap": "critics"}, PER, REDQ, {"intrinsic.reward": "e3b"}],
-    ids=["ddpg", "sac", "per", "drawn quantile critics, delayed policy", "e3b"],
+    [
+        DDPG,
+        {"bootstrap": "critics"},
+        PER | NOISE_AND_STEPS,
+        REDQ,
+        {"intrinsic.reward": "e3b"},
+    ],
+    ids=[
+        "ddpg",
+        "sac",
+        "per, colored noise, three steps",
+        "drawn quantile critics, delayed policy",
+        "e3b",
+    ],
 )
 def test_other_backbones_and_rewards_resume_exactly_too(
     settings: dict[str, Any], tmp_path: Path
