@@ -58,6 +58,8 @@ WANTED = (
     names.MI_REWARD_WEIGHT,
 )
 """Metrics that a report reads."""
+MOST_PROCESSES = 8
+"""Largest number of processes that draw; each needs some memory."""
 SHOWN = 5
 """Largest number of labels in a sentence."""
 _STATES = {
@@ -241,7 +243,7 @@ def _drawn(figures: Sequence[Figure]) -> Iterator[Iterator[Mapping[str, bytes]]]
         return
     # Functions that draw cannot be pickled, so the processes inherit the figures.
     with ProcessPoolExecutor(
-        min(cores, len(figures)), get_context("fork"), _INHERITED.extend, (figures,)
+        min(cores, len(figures), MOST_PROCESSES), get_context("fork"), _INHERITED.extend, (figures,)
     ) as pool:
         with warnings.catch_warnings():  # of Python 3.12, about the idle threads of BLAS
             warnings.simplefilter("ignore", DeprecationWarning)
