@@ -42,6 +42,7 @@ comparing_q
 searching
 reports
 operations
+slurm
 ```
 ```{toctree}
 :hidden:

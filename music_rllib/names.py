@@ -217,6 +217,8 @@ VARIABLE_REPORT = "MUSIC_RLLIB_REPORT"
 """`off`: write no report at a sweep's end."""
 VARIABLE_PROGRESS = "MUSIC_RLLIB_PROGRESS"
 """`all`: print each evaluation, not only one line in 30 seconds for each run."""
+VARIABLE_STUDIES = "MUSIC_RLLIB_STUDIES"
+"""Folder for studies without a database, in place of the sweep's: each driver then has its own."""
 
 
 SYMBOLS = {"q": "entropic_index", "weight": "mi_reward_weight"}

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from ray.tune.search import Searcher
 
 from music_rllib import names
 from music_rllib.config.load import load_config
@@ -22,7 +21,8 @@ from music_rllib.search.controller import SearchController
 from music_rllib.search.outcome import outcome
 from music_rllib.search.searches import open_searches
 from music_rllib.store.history import HISTORY, Report, RunResult, last_values, to_json_lines
-from music_rllib.tune.runner import DagSearcher
+from music_rllib.store.lease import Lease, LeaseFile
+from music_rllib.tune.runner import DagSearcher, SharedRuns
 
 Document = dict[str, Any]
 Formula = Callable[[RunSettings, float], float]
@@ -65,8 +65,16 @@ class Driver:
     """One driver of a sweep; replaces Tune, with runs that end in random order."""
 
     def __init__(
-        self, folder: Path, content: Document, formula: Formula = success, seed: int = 0
+        self,
+        folder: Path,
+        content: Document,
+        formula: Formula = success,
+        seed: int = 0,
+        *,
+        leases: bool = False,
     ) -> None:
+        """With `leases`, another driver may compute the same sweep in turn."""
+        folder.mkdir(exist_ok=True)
         path = folder / "sweep.yaml"
         path.write_text(yaml.safe_dump(content, sort_keys=False))
         config = load_config(path, storage=str(folder / "results"))
@@ -76,13 +84,17 @@ class Driver:
         self.pruned: dict[str, str] = {}
         self.controller = SearchController(
             self.sweep,
-            open_searches(self.sweep),
+            open_searches(self.sweep, alone=True),
             pruned=lambda node, reason: self.pruned.__setitem__(node.label, reason),
         )
         self.controller.recall()
         self._formula = formula
         self._rng = random.Random(seed)
         self._running: list[tuple[Node, int | None]] = []
+        self._lease = Lease.of_this_process("a played driver")
+        self._shared = SharedRuns(self.sweep, [self.controller]) if leases else None
+        if self._shared is not None:
+            self._shared._seconds = 0.0
 
     def play(
         self,
@@ -92,27 +104,34 @@ class Driver:
     ) -> None:
         """Run to the end, or until `stop_after` pieces of runs have been computed."""
         scheduler = self.sweep.scheduler
-        searcher = DagSearcher(scheduler, lambda node: {"key": node.key}, self.controller)
+        searcher = DagSearcher(
+            scheduler, lambda node: {"key": node.key}, self.controller, shared=self._shared
+        )
         running = self._running
         self.controller.refresh()
         while stop_after is None or len(self.computed) < stop_after:
             suggestion = None
             if len(running) < slots:
                 suggestion = searcher.suggest("t")
-            if suggestion == Searcher.FINISHED and not running:
+            if searcher.over and not running:
                 return
             if isinstance(suggestion, dict):
                 node = scheduler.node(suggestion["key"])
+                assert self._shared is None or self._lease_of(node).acquire(self._lease) is None
                 running.append((node, scheduler.until(node.key)))
             elif running:
                 node, until = running.pop(self._rng.randrange(len(running)))
+                self._lease_of(node).release(self._lease.owner)
                 if fails(node):
                     scheduler.fail(node.key)
                     self.controller.failed(node, Failure("it failed", self.sweep.folder))
                 else:
                     self._compute(node, until)
             else:
-                raise AssertionError("Tune would wait for ever")
+                raise AssertionError("it would wait for ever")
+
+    def _lease_of(self, node: Node) -> LeaseFile:
+        return self.sweep.store.work_folder(node.key).lease
 
     def _compute(self, node: Node, until: int | None) -> None:
         self.computed.append(f"{node.key}/{until}")

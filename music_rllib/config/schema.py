@@ -54,6 +54,8 @@ class Resources(StrictModel):
     hang_minutes: float | None = Field(5.0, gt=0)
     """Minutes after which a call of an environment's `step()` or `reset()` counts as hanging: the
     run fails with the stack of the call, and other runs continue. null: no limit."""
+    storage_minutes: float = Field(15.0, ge=0)
+    """Minutes for which runs and the sweep wait for a bucket that does not answer."""
 
     @property
     def bundle(self) -> dict[str, float]:

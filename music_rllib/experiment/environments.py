@@ -76,10 +76,11 @@ def found_runs(sweep: OpenSweep) -> list[FoundRun]:
 def _in_storage(sweep: OpenSweep, run: FoundRun) -> tuple[str, Fingerprint | None]:
     """The progress of a run, or of a shorter run that it would continue, and its environment."""
     store = sweep.store
-    if store.is_finished(run.key):
-        return FINISHED, store.environment(run.key)
     if (progress := sweep.progress(run.key)) is not None:
-        return progress, store.work_folder(run.key).environment()
+        finished = progress == FINISHED
+        return progress, (
+            store.environment(run.key) if finished else store.work_folder(run.key).environment()
+        )
     if run.continuation is not None and sweep.scheduler.knows(run.key):
         steps = sweep.continued_from(sweep.scheduler.node(run.key))
         if steps is not None:

@@ -15,7 +15,7 @@ from music_rllib.experiment.scheduler import DONE, Scheduler
 from music_rllib.experiment.sweep_files import PLAN, SETTINGS, SweepLocation, read_json
 from music_rllib.names import ShortLabels
 from music_rllib.store.history import RunResult
-from music_rllib.store.node_store import NodeStore, damage_in_words
+from music_rllib.store.node_store import CONTINUATIONS, NodeStore, damage_in_words
 from music_rllib.store.storage import DamagedError, StorageError, open_storage
 from music_rllib.store.work_folder import steps_of
 
@@ -104,18 +104,26 @@ class OpenSweep:
         results = zip(self.finished, self.store.map(self.store.result, self.finished), strict=True)
         return {key: result for key, result in results if result is not None}
 
+    @cached_property
+    def existing(self) -> dict[str, set[str]]:
+        """The folders of runs in the storage when they were first asked for."""
+        return self.store.existing()
+
     def continued_from(self, node: Node) -> int | None:
         """Environment steps of the finished shorter run that `node` would continue, if any."""
-        if budget_settings(node.run):
-            return None
         key = continuation_key(node.run, node.source_key)
+        if budget_settings(node.run) or key not in self.existing[CONTINUATIONS]:
+            return None
         steps = [steps_of(name) for name in self.store.continuation(key).names()]
         return max((count for count in steps if count < node.run.env_steps), default=None)
 
     def progress(self, key: str) -> str | None:
         """The progress of a run as text; None if it has neither a result nor a checkpoint."""
-        if self.store.is_finished(key):
+        known = self.scheduler.knows(key) and self.scheduler[key] in DONE
+        if known or (key in self.existing["nodes"] and self.store.is_finished(key)):
             return FINISHED
+        if key not in self.existing["work"]:
+            return None
         checkpoints = self.store.work_folder(key).names()
         return f"is at {steps_of(checkpoints[-1]):,} env steps" if checkpoints else None
 
@@ -162,6 +170,17 @@ def open_sweep(
             key: f"{labels[key]}: damaged, will be retrained: {why}" for key, why in damaged.items()
         },
         recorded=recorded,
+    )
+
+
+def reopened(sweep: OpenSweep) -> OpenSweep:
+    """The sweep with the runs that are finished now."""
+    return open_sweep(
+        sweep.config,
+        sweep.plan,
+        sweep.storage,
+        environments=sweep.environments.now,
+        lenient=bool(sweep.damaged),
     )
 
 

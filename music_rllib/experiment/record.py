@@ -331,8 +331,6 @@ def _changed_searches(
 
 def continued_runs_text(sweep: OpenSweep) -> list[str]:
     """A line about runs that continue finished ones with fewer `env_steps`, if there are any."""
-    if not sweep.store.has_continuations():
-        return []
     left = [node for node in sweep.plan.nodes if node.key not in sweep.finished]
     steps = [done for node in left if (done := sweep.continued_from(node)) is not None]
     if not steps:

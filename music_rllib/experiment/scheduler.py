@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import zlib
 from collections.abc import Collection, Iterator
 from enum import StrEnum
 from pathlib import Path
@@ -42,11 +44,14 @@ class Scheduler:
         self._nodes = {node.key: node for node in plan.nodes}
         seeds = list(dict.fromkeys(node.run.seed for node in plan.nodes))
         inputs = {node.input.key for node in plan.nodes if node.input is not None}
-        in_order = sorted(
-            plan.nodes, key=lambda node: (seeds.index(node.run.seed), node.key not in inputs)
-        )
-        self._turns = {node.key: turn for turn, node in enumerate(in_order)}
+        groups = {
+            node.key: (seeds.index(node.run.seed), node.key not in inputs) for node in plan.nodes
+        }
+        self._turns = {key: (*group, turn) for turn, (key, group) in enumerate(groups.items())}
         self._until: dict[str, int] = {}
+        self._elsewhere: dict[str, None] = {}
+        self._salt: bytes | None = None
+        """Makes an order of this process, once others compute nodes of the plan too."""
         self._status = {
             key: Status.REUSED if key in finished else Status.WAITING for key in self._nodes
         }
@@ -86,12 +91,26 @@ class Scheduler:
         All nodes of a seed come before those of the next seed, so that an interrupted sweep can
         compare its settings. Within a seed, nodes from which others start come first, so that the
         last runs of a sweep do not wait for each other; then in the order of the plan. Nodes that
-        a search has added come last, in the order of their addition.
+        a search has added come last, in the order of their addition. Nodes that another process
+        computes do not count.
         """
-        ready = (node for node in self.having(Status.WAITING) if self._input_is_there(node))
-        return min(
-            ready, key=lambda node: self._turns.get(node.key, len(self._turns)), default=None
+        ready = (
+            node
+            for node in self.having(Status.WAITING)
+            if node.key not in self._elsewhere and self._input_is_there(node)
         )
+        return min(ready, key=self._turn, default=None)
+
+    def _turn(self, node: Node) -> tuple[int, bool, int]:
+        """The order of the plan, or one of this process if others take nodes of the plan too."""
+        seed, late, turn = self._turns.get(node.key, (len(self._turns), True, 0))
+        if self._salt is not None:
+            turn = zlib.crc32(self._salt + node.key.encode())
+        return seed, late, turn
+
+    def waits_for_input(self, key: str) -> bool:
+        """Whether the node waits for a node that is not done."""
+        return self._status[key] is Status.WAITING and not self._input_is_there(self._nodes[key])
 
     def _input_is_there(self, node: Node) -> bool:
         if node.input is None or node.input.checkpoint is not None:
@@ -155,9 +174,26 @@ class Scheduler:
         """Record that the node is being computed."""
         self._move(key, Status.WAITING, Status.STARTED)
 
+    @property
+    def elsewhere(self) -> list[Node]:
+        """Waiting nodes that another process computes."""
+        return [self._nodes[key] for key in self._elsewhere if self._status[key] is Status.WAITING]
+
+    def leave(self, key: str) -> None:
+        """Record that another process computes the node."""
+        self._salt = self._salt or os.urandom(8)
+        self._elsewhere[key] = None
+        self._status[key] = Status.WAITING
+
+    def take_back(self, key: str) -> None:
+        """Record that no other process computes the node any more."""
+        self._elsewhere.pop(key, None)
+
     def finish(self, key: str) -> None:
-        """Record that the node is in the store."""
-        self._move(key, Status.STARTED, Status.FINISHED)
+        """Record that the node is in the store, from this process or another one."""
+        self._elsewhere.pop(key, None)
+        assert self._status[key] in (Status.STARTED, Status.WAITING)
+        self._status[key] = Status.FINISHED
 
     def fail(self, key: str) -> list[Node]:
         """Record that the node failed; skips and returns the waiting nodes that depend on it."""
@@ -217,6 +253,9 @@ class Listener:
 
     def pruned(self, node: Node, reason: str) -> None:
         """The node isn't computed any further because its trial was stopped early."""
+
+    def left(self, node: Node, holder: str) -> None:
+        """Another process, in words, computes the node."""
 
     def tick(self) -> None:
         """Called in every iteration of the driver's loop."""

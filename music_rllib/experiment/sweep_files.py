@@ -44,7 +44,7 @@ ANALYSIS_PLAN, SETTINGS = "analysis_plan.json", "settings.json"
 IN_STORAGE = "storage:"
 """Prefix of a handoff's key in `config.json`: the folder that the user gave may have changed."""
 STOP = "stop.json"
-"""Its presence asks the driver to stop."""
+"""A new one asks all drivers to stop."""
 SILENCE_SECONDS = 90.0
 """A driver on another machine counts as dead if its last heartbeat is older."""
 
@@ -188,7 +188,8 @@ def is_alive(state: Mapping[str, Any] | None) -> bool:
     driver = state["driver"]
     if driver["machine"] == this_machine():
         return runs_here(driver["pid"], driver["process_started"])
-    return bool(time.time() - driver["heartbeat"] < SILENCE_SECONDS)
+    # A heartbeat in the future was written by a fast clock, of a driver that may be dead.
+    return bool(abs(time.time() - driver["heartbeat"]) < SILENCE_SECONDS)
 
 
 def as_json(document: Any) -> str:

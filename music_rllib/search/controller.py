@@ -111,8 +111,16 @@ class SearchController(Listener):
         Claims no more trials than this driver can run now, and leaves the others to other drivers.
         """
         self._score_trials()
-        while self._scheduler.next_ready() is None and self._claim():
+        while self._scheduler.next_ready() is None and not self._is_blocked() and self._claim():
             self._score_trials()
+
+    def _is_blocked(self) -> bool:
+        """Whether a claimed trial only waits for its input, as the next one would."""
+        return any(
+            one.runs and all(self._scheduler.waits_for_input(run.key) for run in one.runs)
+            for search in self.searches
+            for one in search.running
+        )
 
     def stop(self) -> None:
         """Release this driver's trials, and add those of other drivers to the plan."""

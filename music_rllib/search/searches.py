@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 from optuna.trial import FrozenTrial
 
+from music_rllib import names
 from music_rllib.config.schema import Stage
 from music_rllib.config.search import Rung, SearchSettings
 from music_rllib.experiment.open_sweep import OpenSweep
@@ -93,13 +95,17 @@ def check_studies(sweep: OpenSweep) -> None:
             check_database(storage)
 
 
-def open_searches(sweep: OpenSweep) -> list[Search]:
+def open_searches(sweep: OpenSweep, *, alone: bool = False) -> list[Search]:
     """Open the studies of a sweep's searched stages; missing studies are created.
+
+    Args:
+        sweep: The sweep.
+        alone: No other driver runs it.
 
     Raises:
         StorageError: A study's storage can't be used.
     """
-    return [_open_search(sweep, stage) for stage in sweep.plan.searched]
+    return [_open_search(sweep, stage, alone) for stage in sweep.plan.searched]
 
 
 def _base(sweep: OpenSweep, stage: Stage) -> str:
@@ -109,10 +115,11 @@ def _base(sweep: OpenSweep, stage: Stage) -> str:
 
 
 def _storage(sweep: OpenSweep, settings: SearchSettings) -> str:
-    return settings.storage or str(sweep.folder / STUDY_FILE)
+    own = Path(os.environ.get(names.VARIABLE_STUDIES) or sweep.folder)
+    return settings.storage or str(own / STUDY_FILE)
 
 
-def _open_search(sweep: OpenSweep, stage: Stage) -> Search:
+def _open_search(sweep: OpenSweep, stage: Stage, alone: bool) -> Search:
     settings = stage.search
     assert settings is not None
     sweep.folder.mkdir(parents=True, exist_ok=True)
@@ -124,8 +131,8 @@ def _open_search(sweep: OpenSweep, stage: Stage) -> Search:
             settings,
             determined_by,
             compared=values,
-            # The file is in the sweep's folder, which this process has locked.
-            alone=settings.storage is None,
+            # Only drivers of this sweep use the file in its folder.
+            alone=alone and settings.storage is None,
         )
         for values in settings.compared()
     ]

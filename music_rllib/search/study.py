@@ -73,12 +73,11 @@ class OptunaStudy:
             settings: Settings of its search.
             determined_by: Plain data of everything else that determines its values.
             compared: Its compared values; empty in `search` mode.
-            alone: No other driver can be running: running trials belong to a dead one.
+            alone: No other driver is running now: running trials belong to a dead one.
         """
         self.settings = settings
         self.compared = dict(compared)
         self._storage = storage
-        self._alone = alone
         self._me = f"{socket.gethostname()}:{os.getpid()}:{uuid.uuid4().hex[:8]}"
         self._id, self.name = find_or_create(storage, base, settings, determined_by, compared)
         attributes = storage.get_study_user_attrs(self._id)
@@ -93,7 +92,9 @@ class OptunaStudy:
             storage.create_new_trial(self._id, create_trial(state=TrialState.WAITING))
         # Before it claims a trial, so that no other driver takes it for dead.
         storage.set_study_user_attr(self._id, f"{DRIVER}{self._me}", time.time())
-        self.release_the_dead()
+        self._seen: dict[str, tuple[float, float]] = {}
+        """Last heartbeat of each other driver, and the monotonic time when it was first seen."""
+        self.release_the_dead(alone=alone)
 
     # -- reading -----------------------------------------------------------------------------
 
@@ -230,12 +231,10 @@ class OptunaStudy:
         if abs(now - self._last_heartbeat) >= HEARTBEAT_SECONDS:  # the clock may be set back
             self._last_heartbeat = now
             self._storage.set_study_user_attr(self._id, f"{DRIVER}{self._me}", now)
-            if not self._alone:
-                self.release_the_dead(now)
+            self.release_the_dead()
 
-    def release_the_dead(self, now: float | None = None) -> None:
-        """Return the trials of dead drivers to the waiting ones."""
-        now = time.time() if now is None else now
+    def release_the_dead(self, *, alone: bool = False) -> None:
+        """Return the trials of dead drivers to the waiting ones; `alone`: of all other drivers."""
         self.refresh()
         trials = self.trials()
         # Read after the trials: the owner of a claimed trial had recorded a heartbeat before.
@@ -244,15 +243,23 @@ class OptunaStudy:
             owner = trial.user_attrs.get(OWNER, "")
             if trial.state is not TrialState.RUNNING or owner == self._me:
                 continue
-            if not owner and not self._alone:
-                # Claimed a moment ago: its owner is about to write its name.
-                started = trial.datetime_start
-                if started is not None and now - started.timestamp() < LEASE_SECONDS:
-                    continue
             last = float(heartbeats.get(f"{DRIVER}{owner}", 0.0))
-            if self._alone or _is_dead(owner) or now - last > LEASE_SECONDS:
+            if not owner and trial.datetime_start is not None:
+                # Claimed a moment ago: its owner is about to write its name.
+                last, owner = trial.datetime_start.timestamp(), f"trial {trial.number}"
+            if alone or self._is_dead(owner, last):
                 self._move(trial, TrialState.WAITING)
         self.refresh()
+
+    def _is_dead(self, owner: str, heartbeat: float) -> bool:
+        """Whether a driver is a process of this machine that has ended, or shows no life.
+
+        Its heartbeat is old, or was dated ahead by a fast clock and does not change.
+        """
+        if self._seen.get(owner, (None,))[0] != heartbeat:
+            self._seen[owner] = (heartbeat, time.monotonic())
+        unchanged = time.monotonic() - self._seen[owner][1]
+        return _has_ended(owner) or max(time.time() - heartbeat, unchanged) > LEASE_SECONDS
 
     def release(self) -> None:
         """Return this driver's trials to the waiting ones."""
@@ -269,7 +276,7 @@ class OptunaStudy:
             return False
 
 
-def _is_dead(owner: str) -> bool:
+def _has_ended(owner: str) -> bool:
     """Whether a driver was a process of this machine, and has ended."""
     host, _, rest = owner.partition(":")
     pid = rest.partition(":")[0]

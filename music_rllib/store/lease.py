@@ -155,10 +155,10 @@ class LeaseFile:
         """Acquire the lease and return None, or return the valid lease of another owner."""
         # A process that only waits must not write to a folder that the owner may be deleting.
         with contextlib.suppress(OSError):  # raised below, with the path
-            if (holder := self._other_holder(lease)) is not None:
+            if (holder := self.holder(lease.owner)) is not None:
                 return holder
         with self._locked(LOCK_ATTEMPTS):
-            if (holder := self._other_holder(lease)) is not None:
+            if (holder := self.holder(lease.owner)) is not None:
                 return holder
             self._write(lease)
         if self._folder.is_local:
@@ -167,15 +167,35 @@ class LeaseFile:
         holder = self.read()
         return None if holder is None or holder.owner == lease.owner else holder
 
-    def _other_holder(self, lease: Lease) -> Lease | None:
-        holder = self.read()
-        if holder is None or holder.owner == lease.owner or not holder.holds():
-            return None
-        if holder != self._seen[0]:
-            self._seen = (holder, time.monotonic())
-        # A lease that expires later was dated by another clock, or before this one was set back.
-        stale = time.monotonic() - self._seen[1] >= EXPIRES_SECONDS
-        return None if holder.seconds > EXPIRES_SECONDS and stale else holder
+    def holder(self, me: str = "", *, watch: bool = False) -> Lease | None:
+        """The valid lease of another owner than `me`.
+
+        A lease that a fast clock has dated ahead is valid while it is renewed. This takes several
+        looks; with `watch` this method looks for up to a minute.
+        """
+        while True:
+            holder, first = self.read(), self._seen[0]
+            if holder is None or holder.owner == me or not holder.holds():
+                return None
+            if holder != first:
+                self._seen = (holder, time.monotonic())
+            # It was dated by another clock, or before this one was set back.
+            ahead = holder.seconds > EXPIRES_SECONDS
+            if ahead and time.monotonic() - self._seen[1] >= EXPIRES_SECONDS:
+                return None
+            renewed = first is not None and first.owner == holder.owner and first != holder
+            if renewed or not (watch and ahead):
+                return holder
+            time.sleep(LOOK_SECONDS)
+
+    def remove_invalid(self) -> None:
+        """Delete the lease that `holder` has seen and does not return any more.
+
+        Other processes need not watch it for as long.
+        """
+        if (seen := self._seen[0]) is not None:
+            self.release(seen.owner)
+            self._seen = (None, 0.0)
 
     def renew(self, lease: Lease) -> bool:
         """Write the lease again, unless another owner has it; returns whether it was written."""

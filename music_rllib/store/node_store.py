@@ -21,7 +21,7 @@ import json
 import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
@@ -34,6 +34,8 @@ from music_rllib.store.work_folder import KEEP, WorkFolder, environment_of
 
 K = TypeVar("K")
 V = TypeVar("V")
+FEW = 64
+"""Number of nodes up to which a request for each is cheaper than a list of all files."""
 SHOWN = 10
 """Number of damaged runs that a message names."""
 SETTLED_SECONDS = 2.0
@@ -61,7 +63,10 @@ class NodeStore(SealedFolders):
     def finished(self, keys: Iterable[str]) -> set[str]:
         """The published nodes among `keys`."""
         present = set(keys).intersection(self.folder.folders())
-        return set(self.folder.having(MANIFEST, present))
+        if self._root.is_local or len(present) <= FEW:
+            return set(self.folder.having(MANIFEST, present))
+        sizes = self._sizes()
+        return {key for key in present if f"{self.path(key)}/{MANIFEST}" in sizes}
 
     def result(self, key: str) -> RunResult | None:
         """The result of a finished run; None for an imported handoff."""
@@ -155,7 +160,8 @@ class NodeStore(SealedFolders):
         times is not read again.
         """
         keys, before = list(keys), dict(self._verified)
-        errors = zip(keys, self.map(self._damage_of, keys), strict=True)
+        sizes = None if self._root.is_local or len(keys) <= FEW else self._sizes()
+        errors = zip(keys, self.map(partial(self._damage_of, sizes=sizes), keys), strict=True)
         damaged = {key: error for key, error in errors if error is not None}
         if self._verified != before:
             with contextlib.suppress(OSError):  # without the file, nodes are verified again
@@ -175,11 +181,16 @@ class NodeStore(SealedFolders):
             return {key: str(value) for key, value in dict(content).items()}
         return {}
 
-    def _damage_of(self, key: str) -> DamagedError | None:
+    def _sizes(self) -> dict[str, int]:
+        """Size of every file of all nodes, by its path."""
+        entries = self.folder.entries(recursive=True)
+        return {entry.path.removeprefix("/"): entry.size for entry in entries}
+
+    def _damage_of(self, key: str, sizes: Mapping[str, int] | None) -> DamagedError | None:
         try:
             fingerprint = self._fingerprint(key) if self._root.is_local else None
             if fingerprint is None or self._verified.get(key) != fingerprint:
-                self._check(key)
+                self._check(key, sizes)
                 if fingerprint is not None:
                     self._verified[key] = fingerprint
         except DamagedError as error:
@@ -204,8 +215,8 @@ class NodeStore(SealedFolders):
             newest = max(newest, status.st_mtime_ns, status.st_ctime_ns)
         return None if time.time() - newest / 1e9 < SETTLED_SECONDS else digest.hexdigest()[:20]
 
-    def _check(self, key: str) -> None:
-        manifest = self.check(key)
+    def _check(self, key: str, sizes: Mapping[str, int] | None) -> None:
+        manifest = self.check(key, sizes)
         result = self._result(manifest)
         # The manifest has no hash of its own, but the history has the values of its result too.
         if self._root.is_local and result is not None and HISTORY in manifest.files:
@@ -225,9 +236,10 @@ class NodeStore(SealedFolders):
         """The folder of an unfinished run, with its newest `keep` checkpoints."""
         return WorkFolder(self._root / "work" / key, keep)
 
-    def has_continuations(self) -> bool:
-        """Whether any folder of `continuation` exists."""
-        return bool((self._root / CONTINUATIONS).folders())
+    def existing(self) -> dict[str, set[str]]:
+        """Names of all folders in `nodes`, `work` and `continuations`, by three listings."""
+        places = ("nodes", "work", CONTINUATIONS)
+        return {name: set((self._root / name).folders()) for name in places}
 
     def continuation(self, key: str) -> WorkFolder:
         """The folder with the last checkpoint of the longest of runs that differ only in budget."""

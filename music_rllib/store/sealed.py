@@ -16,11 +16,10 @@ import os
 import shutil
 import tempfile
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, BinaryIO, Literal
 
-import pyarrow.fs as pafs
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue, ValidationError
 
 from music_rllib.limits import MOST_JSON_BYTES, open_regular, read_json
@@ -78,6 +77,8 @@ class SealedFolders:
 
     def __init__(self, folder: StorageFolder) -> None:
         self.folder = folder
+        self._kept: dict[str, bytes] = {}
+        """Checked manifests in a bucket, which do not change."""
 
     def path(self, name: str) -> str:
         """Path of the sealed folder `name`, whether it exists or not."""
@@ -92,12 +93,14 @@ class SealedFolders:
         """Whether the folder has been sealed; it may have been damaged since."""
         return bool(self.folder.having(MANIFEST, [name]))
 
-    def manifest(self, name: str) -> Manifest:
+    def manifest(self, name: str, *, keep: bool = False) -> Manifest:
         """The manifest of a sealed folder."""
         path = f"{self.path(name)}/{MANIFEST}"
         try:
-            with self._open(path) as stream:
-                manifest = Manifest.model_validate(read_json(stream.read(MOST_JSON_BYTES + 1)))
+            data = self._kept.get(name) or self._start_of(path)
+            manifest = Manifest.model_validate(read_json(data))
+            if keep:
+                self._kept[name] = data
         except FileNotFoundError as error:
             raise DamagedError(f"{path} must exist, it does not") from error
         except ValueError as error:
@@ -108,6 +111,15 @@ class SealedFolders:
         if manifest.name != name:
             raise DamagedError(f"{path} must be the manifest of {name}, got {manifest.name!r}")
         return manifest
+
+    def _start_of(self, path: str) -> bytes:
+        """Content of a file, or one byte more than JSON may have."""
+
+        def read() -> bytes:
+            with self._open(path) as stream:
+                return bytes(stream.read(MOST_JSON_BYTES + 1))
+
+        return self.folder.request(read)
 
     @contextlib.contextmanager
     def sealing(self, name: str, meta: dict[str, Any]) -> Iterator[Path]:
@@ -157,14 +169,18 @@ class SealedFolders:
         sync_folder(target.parent)
 
     def _upload(self, name: str, draft: Path, prefix: str, meta: dict[str, Any]) -> None:
-        records, filesystem = {}, self.folder.filesystem
+        records = {}
         for file in _files_below(draft):
             records[file] = _record(draft / file)
-            target = f"{self.path(name)}/{prefix}{file}"
-            with (draft / file).open("rb") as source, filesystem.open_output_stream(target) as sink:
-                shutil.copyfileobj(source, sink, _CHUNK)
+            with (draft / file).open("rb") as source:
+
+                def copy(sink: Any, source: BinaryIO = source) -> None:
+                    source.seek(0)
+                    shutil.copyfileobj(source, sink, _CHUNK)
+
+                self.folder.upload(f"{self.path(name)}/{prefix}{file}", copy)
         if self.exists(name):
-            filesystem.delete_dir(f"{self.path(name)}/{prefix}")
+            self.folder.delete(f"{name}/{prefix}")
             return
         manifest = Manifest(name=name, prefix=prefix, files=records, meta=meta)
         self.folder.write(f"{name}/{MANIFEST}", manifest.model_dump_json(indent=1).encode())
@@ -178,21 +194,23 @@ class SealedFolders:
         self._copy(self._source(manifest, file), manifest.files[file], content.write)
         return content.getvalue()
 
-    def check(self, name: str) -> Manifest:
+    def check(self, name: str, sizes: Mapping[str, int] | None = None) -> Manifest:
         """Compare the size of every file with the manifest, and on a disk its hash too.
 
-        A bucket has hashes of its own; files from it are hashed when they are read.
+        A bucket has hashes of its own; files from it are hashed when they are read. With the
+        `sizes` of all files there, by path, only the manifest is read.
         """
-        manifest = self.manifest(name)
+        self._kept.pop(name, None)
+        manifest = self.manifest(name, keep=not self.folder.is_local)
         for file, expected in manifest.files.items():
             source = self._source(manifest, file)
             if self.folder.is_local:
                 self._copy(source, expected, write=len)
                 continue
-            info = self.folder.filesystem.get_file_info(source)
-            if info.type == pafs.FileType.NotFound:
+            size = self.folder.info(source).size if sizes is None else sizes.get(source)
+            if size is None:
                 raise DamagedError(f"{source} must exist, its manifest lists it")
-            _check_size(source, expected, info.size)
+            _check_size(source, expected, size)
         return manifest
 
     def paths(self, name: str) -> list[str]:
@@ -216,12 +234,18 @@ class SealedFolders:
     def _copy(self, source: str, expected: FileRecord, write: Callable[[bytes], object]) -> None:
         """Pass a file to `write` in chunks, and at most one byte more than the manifest says."""
         size, digest = 0, hashlib.sha256()
-        try:
+
+        def read_on() -> None:
+            nonlocal size
             with self._open(source, expected.bytes) as stream:
+                stream.read(size)  # read by an attempt that failed
                 while chunk := stream.read(min(_CHUNK, expected.bytes + 1 - size)):
                     write(chunk)
                     digest.update(chunk)
                     size += len(chunk)
+
+        try:
+            self.folder.request(read_on)
         except FileNotFoundError as error:
             raise DamagedError(f"{source} must exist, its manifest lists it") from error
         _check_size(source, expected, size)
@@ -251,6 +275,7 @@ class SealedFolders:
 
     def remove(self, name: str) -> None:
         """Delete a folder, its manifest first, so that a half-deleted folder does not count."""
+        self._kept.pop(name, None)
         self.folder.remove(f"{name}/{MANIFEST}")
         (self.folder / name).delete()
 

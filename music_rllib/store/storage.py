@@ -15,13 +15,14 @@ from collections.abc import Callable, Container, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 from urllib.parse import quote, unquote
 
 import pyarrow.fs as pafs
 
 from music_rllib.errors import BadInputError
 from music_rllib.redaction import redact
+from music_rllib.store.patience import patiently
 
 K = TypeVar("K")
 V = TypeVar("V")
@@ -118,9 +119,13 @@ class StorageFolder:
 
     def read(self, name: str) -> bytes | None:
         """Content of a small file; None if it does not exist."""
-        try:
+
+        def read() -> bytes:
             with self.filesystem.open_input_stream(f"{self.path}/{name}") as stream:
                 return bytes(stream.read())
+
+        try:
+            return self.request(read)
         except FileNotFoundError:
             return None
 
@@ -141,30 +146,52 @@ class StorageFolder:
                 Path(path).parent.mkdir(parents=True, exist_ok=True)
                 write_atomically(Path(path), data)
                 return
+            self.upload(path, lambda sink: sink.write(data))
+
+    def upload(self, path: str, write: Callable[[Any], object]) -> None:
+        """Write an object of a bucket; `write` gets the stream, again if an attempt fails."""
+
+        def attempt() -> None:
             with self.filesystem.open_output_stream(path) as sink:
-                sink.write(data)
+                write(sink)
+
+        patiently(attempt)
+
+    def request(self, call: Callable[[], V]) -> V:
+        """The result of a call of the file system, which is repeated if it asks a bucket."""
+        return call() if self.is_local else patiently(call)
 
     def remove(self, name: str) -> None:
         """Delete a file if it exists."""
         with contextlib.suppress(FileNotFoundError):
-            self.filesystem.delete_file(f"{self.path}/{name}")
+            self.request(lambda: self.filesystem.delete_file(f"{self.path}/{name}"))
 
-    def delete(self) -> None:
-        """Delete this folder with its content if it exists."""
+    def delete(self, name: str = "") -> None:
+        """Delete this folder, or the one called `name` in it, with its content if it exists."""
         with contextlib.suppress(FileNotFoundError):
-            self.filesystem.delete_dir(self.path)
+            self.request(lambda: self.filesystem.delete_dir(f"{self.path}/{name}".rstrip("/")))
 
     def folders(self) -> list[str]:
         """Names of the folders in this folder."""
-        selector = pafs.FileSelector(self.path, allow_not_found=True)
-        infos = self.filesystem.get_file_info(selector)
-        return [info.base_name for info in infos if not info.is_file]
+        return [info.base_name for info in self.entries() if not info.is_file]
+
+    def files(self) -> list[str]:
+        """Names of the files in this folder."""
+        return [info.base_name for info in self.entries() if info.is_file]
+
+    def entries(self, *, recursive: bool = False) -> list[pafs.FileInfo]:
+        """What is in this folder; `recursive`: and below it."""
+        selector = pafs.FileSelector(self.path, allow_not_found=True, recursive=recursive)
+        return self.request(lambda: self.filesystem.get_file_info(selector))
+
+    def info(self, path: str) -> pafs.FileInfo:
+        """Type and size of a file or folder."""
+        return self.request(lambda: self.filesystem.get_file_info(path))
 
     def having(self, file: str, folders: Iterable[str]) -> list[str]:
         """The folders among `folders` that contain `file`."""
         folders = list(folders)
-        paths = [f"{self.path}/{name}/{file}" for name in folders]
-        infos = self.map(self.filesystem.get_file_info, paths)
+        infos = self.map(self.info, [f"{self.path}/{name}/{file}" for name in folders])
         return [name for name, info in zip(folders, infos, strict=True) if info.is_file]
 
     def map(self, read: Callable[[K], V], keys: Iterable[K]) -> Iterator[V]:

@@ -13,10 +13,12 @@ from music_rllib.errors import BadInputError
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.sweep_files import SweepLocation, sweeps_in
 from music_rllib.redaction import redact
+from music_rllib.store.lease import Lease
 from music_rllib.store.node_store import CONTINUATIONS
 from music_rllib.store.sealed import MANIFEST
 from music_rllib.store.storage import StorageFolder, is_remote, open_storage, sweep_folder
-from music_rllib.sweep.driver_lock import has_driver
+from music_rllib.store.work_folder import WorkFolder
+from music_rllib.sweep.driver_lock import drivers_of
 
 Item = dict[str, str]
 """`{"path": ..., "what": ...}`."""
@@ -32,6 +34,8 @@ class Cleaning:
     """A description of each of them."""
     kept: list[Item] = field(default_factory=list)
     """Folders that one might expect to be deleted, and why they are kept."""
+    begun: list[WorkFolder] = field(default_factory=list)
+    """Those of them that have a lease."""
 
     def add(self, folder: StorageFolder, what: str) -> None:
         """Mark a folder to be deleted."""
@@ -43,7 +47,20 @@ class Cleaning:
         self.kept.append({"path": path, "what": what})
 
     def delete(self) -> None:
-        """Delete the folders, each run's manifest first: without it, the run is not finished."""
+        """Delete the folders, each run's manifest first: without it, the run is not finished.
+
+        Raises:
+            BadInputError: Another process computes one of the runs; nothing was deleted.
+        """
+        mine, files = Lease.of_this_process("clean"), [work.lease for work in self.begun]
+        holders = [holder for file in files if (holder := file.acquire(mine)) is not None]
+        if holders:
+            for file in files:
+                file.release(mine.owner)
+            raise BadInputError(
+                f"SWEEP must have no run that another process computes to be cleaned, got "
+                f"{holders[0]}: stop it, or wait for a minute after its end"
+            )
         for folder in self.folders:
             folder.remove(MANIFEST)
             folder.delete()
@@ -88,6 +105,7 @@ def find_deletable(location: SweepLocation, *, unfinished: bool, everything: boo
             if key not in finished and key not in pruned:
                 why = "interrupted"
             if why != "interrupted" or unfinished:
+                cleaning.begun.append(WorkFolder(storage / "work" / key))
                 cleaning.add(storage / "work" / key, f"checkpoints of {label}: {why}")
         if key in finished and (last := node.get("continuation")) in continued:
             folder, what = storage / CONTINUATIONS / last, f"last checkpoint of {label}"
@@ -115,7 +133,8 @@ def _add_own_files(location: SweepLocation, storage: StorageFolder, cleaning: Cl
 
 
 def _is_driven(location: SweepLocation, state: Mapping[str, Any] | None) -> bool:
-    return sweep_files.is_alive(state) or has_driver(location.storage, location.name)
+    drivers = drivers_of(location.storage, location.name, watch=True)
+    return sweep_files.is_alive(state) or bool(drivers)
 
 
 def _nodes(location: SweepLocation) -> list[dict[str, Any]]:

@@ -5,6 +5,7 @@ Both load, open and check a sweep in the same way.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 from collections.abc import Sequence
@@ -27,7 +28,7 @@ from music_rllib.experiment.environments import (
     found_runs,
     remove_runs,
 )
-from music_rllib.experiment.open_sweep import OpenSweep, open_sweep, remove_damaged
+from music_rllib.experiment.open_sweep import OpenSweep, open_sweep, remove_damaged, reopened
 from music_rllib.experiment.plan import make_plan, shared_runs
 from music_rllib.experiment.record import changes_since, continued_runs_text, keep_record
 from music_rllib.experiment.sweep_files import ANALYSIS_PLAN, STATE
@@ -40,6 +41,7 @@ from music_rllib.runtime.machine import (
     ray_parent,
 )
 from music_rllib.runtime.process import early
+from music_rllib.store.patience import be_patient
 from music_rllib.store.storage import check_storage, is_remote, resolve_storage
 from music_rllib.sweep import preflight
 from music_rllib.sweep.preflight import check_demand
@@ -142,7 +144,7 @@ def run(
         BadInputError: Nothing was started; as other errors that name what to change.
     """
     # `plan` needs none of it.
-    from music_rllib.sweep.driver_lock import hold_driver_lock
+    from music_rllib.sweep.driver_lock import alone, driving
     from music_rllib.sweep.execution import compute_and_report, open_tracker
 
     console = console_for(as_json=as_json)
@@ -155,20 +157,33 @@ def run(
         again, kept = decide(
             opened, found_runs(opened), retrain, all_changed=accept_changes, keep=keep_runs
         )
-        with hold_driver_lock(opened, partial(_say, console)), early:
-            remove_damaged(opened, warn)
-            opened = accept_environments(remove_runs(opened, again, warn), kept, warn)
-            _check(opened)
-            with open_tracker(opened) as tracker:
+        be_patient(config.resources.storage_minutes, warn)
+        with (
+            driving(opened.storage, config.name) as drivers,
+            contextlib.ExitStack() as stack,
+            early,
+        ):
+            with alone(opened.storage, config.name, partial(_say, console)) as waited:
+                if opened.damaged or again:
+                    drivers.check_alone()
+                if waited:
+                    opened = reopened(opened)
+                remove_damaged(opened, warn)
+                opened = accept_environments(remove_runs(opened, again, warn), kept, warn)
+                _check(opened)
+                tracker = stack.enter_context(open_tracker(opened))
                 for retrained in again:
                     tracker.forget(retrained.key)
                 keep_record(opened)
                 plans = _record_analysis_plan(console, opened)
-                code = compute_and_report(console, opened, tracker, plans)
+                shares = bool(drivers.others())
+            code = compute_and_report(console, opened, tracker, plans, drivers, shares=shares)
         if as_json:
             print_json(opened.location.read(STATE) or {})
     except (KeyboardInterrupt, SystemExit) as stopped:
         return _stopped_early(console, stopped)
+    finally:
+        be_patient(0.0)
     return code
 
 
@@ -238,7 +253,6 @@ def _with_environment(console: Console, config: SweepConfig) -> SweepConfig:
 def _check(opened: OpenSweep) -> None:
     """Run every check that can reject the sweep, before recording that it started."""
     preflight.import_checkpoints(opened.plan, opened.store)
-    preflight.verify_inputs(opened.scheduler, opened.store)
     preflight.check_searches(opened)
     if (address := cluster_address()) is not None and not opened.scheduler.complete:
         check_reachable(address)

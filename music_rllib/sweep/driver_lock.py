@@ -1,63 +1,101 @@
-"""The lease that lets only one process at a time drive a sweep."""
+"""The drivers of a sweep: any number computes its runs, one at a time prepares or deletes files.
+
+Each driver holds a lease of its own in `<storage>/<sweep>/drivers`, by which others know that it is
+running. The runs have leases too, so drivers never compute the same run. The lease `driver.json`
+lets one process at a time change what all of them use: the sweep's records, its parent run in
+MLflow, its report, and results that are deleted.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
-from music_rllib.errors import FAILED
-from music_rllib.experiment.open_sweep import OpenSweep
-from music_rllib.runtime.process import end_process
+from music_rllib.errors import BadInputError
 from music_rllib.store.lease import HeldLease, Lease, LeaseFile
-from music_rllib.store.storage import StorageError, open_storage
+from music_rllib.store.storage import open_storage
 
-FILE = "driver.json"
+FILE, DRIVERS = "driver.json", "drivers"
+WAIT_SECONDS = 1.0
+"""Time between two attempts to get `driver.json`."""
 
 
-def has_driver(storage: str, name: str) -> bool:
-    """Whether a process drives the sweep, even if it has not written `state.json` yet."""
-    lease = LeaseFile(open_storage(storage) / name, FILE).read()
-    return lease is not None and lease.holds()
+def drivers_of(storage: str, name: str, *, watch: bool = False) -> list[Lease]:
+    """The leases of the processes that drive a sweep.
+
+    Args:
+        storage: Folder or URI.
+        name: The sweep's name.
+        watch: Look for up to a minute at leases that a fast clock has dated ahead.
+    """
+    folder = open_storage(storage) / name / DRIVERS
+    files = [LeaseFile(folder, file) for file in folder.files() if not file.startswith(".")]
+    return [lease for file in files if (lease := file.holder(watch=watch)) is not None]
+
+
+@dataclass(frozen=True)
+class Drivers:
+    """The drivers of a sweep, from the view of one of them."""
+
+    storage: str
+    name: str
+    owner: str
+    """Owner of this driver's lease."""
+
+    def others(self, *, watch: bool = False) -> list[Lease]:
+        """The leases of all other drivers."""
+        leases = drivers_of(self.storage, self.name, watch=watch)
+        return [lease for lease in leases if lease.owner != self.owner]
+
+    def check_alone(self) -> None:
+        """Check that this is the only driver, before results are deleted.
+
+        Raises:
+            BadInputError: There is another one.
+        """
+        if others := self.others(watch=True):
+            raise BadInputError(
+                "--retrain, --retrain-damaged and --accept-changes delete results and must be "
+                f"given while no other process runs {self.name}, got {others[0]}: stop it first"
+            )
 
 
 @contextlib.contextmanager
-def hold_driver_lock(sweep: OpenSweep, say: Callable[[str], None] = print) -> Iterator[None]:
-    """Hold the lease of the sweep's driver, which only one process on any machine can have.
-
-    A process that was suspended ends at once if another process now drives the sweep, because both
-    would write the sweep's files.
-
-    Args:
-        sweep: The sweep to drive.
-        say: Receives the reason before the process ends.
+def alone(storage: str, name: str, say: Callable[[str], None]) -> Iterator[bool]:
+    """Hold the lease `driver.json`; yields whether it had to wait for another process.
 
     Raises:
-        StorageError: Another process has the lease, or the storage can't be written.
+        StorageError: The storage can't be written.
     """
-    place, owner = open_storage(sweep.storage) / sweep.plan.name, f"sweep {sweep.plan.name!r}"
-    file, folder = LeaseFile(place, FILE), place.path
-    lease = Lease.of_this_process(owner)
-    holder = file.acquire(lease)
-    if holder is not None:
-        raise StorageError(
-            f"{folder} must be used by one process at a time, and another one has it: {holder}. "
-            "Wait for its end, stop it, or give this sweep another --name"
-        )
-
-    def lost() -> None:
-        again = Lease.of_this_process(owner)
-        taken_by = file.acquire(again)
-        if taken_by is None:  # the other process has ended
-            held.append(HeldLease(file, again, lost))
-            return
-        say(
-            f"{folder} has been taken over by {taken_by} while this process was suspended; this "
-            f"process ends. Its progress: music-rllib status {sweep.folder}"
-        )
-        end_process(FAILED)
-
-    held = [HeldLease(file, lease, lost)]
+    file = LeaseFile(open_storage(storage) / name, FILE)
+    lease, waited = Lease.of_this_process(f"sweep {name!r}"), False
+    while (holder := file.acquire(lease)) is not None:
+        if not waited:
+            say(f"waits for {holder}, which prepares or ends")
+        waited = True
+        time.sleep(WAIT_SECONDS)
+        lease = Lease.of_this_process(lease.what)
+    held = HeldLease(file, lease)
     try:
-        yield
+        yield waited
     finally:
-        held[-1].release()
+        held.release()
+
+
+@contextlib.contextmanager
+def driving(storage: str, name: str) -> Iterator[Drivers]:
+    """Hold the lease of a driver.
+
+    Raises:
+        StorageError: The storage can't be written.
+    """
+    lease = Lease.of_this_process(f"sweep {name!r}")
+    file = LeaseFile(open_storage(storage) / name / DRIVERS, f"{lease.owner}.json")
+    file.acquire(lease)
+    held = HeldLease(file, lease)
+    try:
+        yield Drivers(storage, name, lease.owner)
+    finally:
+        held.release()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import subprocess
@@ -28,12 +29,14 @@ from music_rllib.search.controller import SearchController
 from music_rllib.search.outcome import outcome
 from music_rllib.search.searches import open_searches
 from music_rllib.store.storage import below, is_remote, sweep_folder
+from music_rllib.sweep.driver_lock import Drivers, alone
 from music_rllib.sweep.listeners.mlflow_view import VERSIONS, comparison_view
 from music_rllib.sweep.listeners.prometheus import PrometheusListener
 from music_rllib.sweep.listeners.screen import Display
 from music_rllib.sweep.listeners.state_file import StateFile
 from music_rllib.sweep.views.results import results_table, search_views
-from music_rllib.tracking.tracker import MlflowListener, Tracker
+from music_rllib.tracking.listener import MlflowListener
+from music_rllib.tracking.tracker import Tracker
 
 LAST_SECONDS = 20.0
 """Time to write the last state and to close MLflow's runs after Ray has died."""
@@ -62,15 +65,23 @@ def open_tracker(opened: OpenSweep) -> Tracker:
 
 
 def compute_and_report(
-    console: Console, opened: OpenSweep, tracker: Tracker, plans: Sequence[dict[str, Any]]
+    console: Console,
+    opened: OpenSweep,
+    tracker: Tracker,
+    plans: Sequence[dict[str, Any]],
+    drivers: Drivers,
+    *,
+    shares: bool,
 ) -> int:
     """Compute what is left, show the results and write the report; the exit code.
 
     Args:
         console: Shows progress and results.
-        opened: The sweep, whose lock this process holds.
+        opened: The sweep.
         tracker: As `open_tracker` returns it.
         plans: The recorded versions of its analysis plan, as plain data.
+        drivers: The sweep's drivers.
+        shares: Whether another driver runs the sweep already.
     """
     if plans:
         tracker.put_sweep_artifact(names.ARTIFACT_ANALYSIS_PLAN, as_json(plans))
@@ -79,11 +90,12 @@ def compute_and_report(
         StateFile(opened) as state_file,
     ):
         mlflow_log = MlflowListener(tracker, opened.store, opened.environments.now)
+        mlflow_log.postpones = shares  # the last driver logs what none of them has computed
         display.headline = state_file.headline
         _take_over_reused(opened, display, mlflow_log)
         controller = None
         if opened.plan.searched:
-            controller = begin_searches(opened, display, mlflow_log, state_file)
+            controller = begin_searches(opened, display, mlflow_log, state_file, alone=not shares)
         tracker.keep_current(node.key for node in opened.plan.nodes)
         stopped_by = _compute(opened, display, mlflow_log, state_file, controller)
         searches = [] if controller is None else end_searches(opened, controller, tracker)
@@ -99,8 +111,16 @@ def compute_and_report(
     def say_left(records: int) -> None:
         console.print(f"Sending to MLflow: {records:,} records left (Ctrl-C to send them later)")
 
-    tracker.close("KILLED" if stopped_by else "FAILED" if failed else "FINISHED", say=say_left)
-    _show_results(console, opened, tracker, state_file, searches)
+    # A stopped driver does not wait for the report of another one.
+    storage, config, report = opened.storage, opened.config, None
+    with contextlib.nullcontext() if stopped_by else alone(storage, config.name, display.say):
+        if not drivers.others():
+            mlflow_log.log_postponed()
+        tracker.close("KILLED" if stopped_by else "FAILED" if failed else "FINISHED", say=say_left)
+        _show_results(console, opened, tracker, state_file, searches)
+        if not stopped_by:
+            uri = config.mlflow.tracking_uri
+            report = report_at_end(storage, config.name, uri, config.path)
     if lost:
         console.print(
             f"{lost} trials failed because a run of theirs failed. This study does not try them "
@@ -111,8 +131,6 @@ def compute_and_report(
     if stopped_by is not None:
         console.print(how_to_continue(), soft_wrap=True)
         return 128 + stopped_by
-    config = opened.config
-    report = report_at_end(opened.storage, config.name, config.mlflow.tracking_uri, config.path)
     if report is not None:
         console.print(report, soft_wrap=True)
     return FAILED if failed else 0
@@ -195,7 +213,12 @@ def _show_results(
 
 
 def begin_searches(
-    opened: OpenSweep, display: Display, mlflow_log: MlflowListener, state_file: StateFile
+    opened: OpenSweep,
+    display: Display,
+    mlflow_log: MlflowListener,
+    state_file: StateFile,
+    *,
+    alone: bool,
 ) -> SearchController:
     """Open the searches, add their earlier trials, and plan the first runs."""
 
@@ -204,7 +227,11 @@ def begin_searches(
         state_file.reused(node)
 
     controller = SearchController(
-        opened, open_searches(opened), reused=reused, pruned=mlflow_log.pruned, say=display.say
+        opened,
+        open_searches(opened, alone=alone),
+        reused=reused,
+        pruned=mlflow_log.pruned,
+        say=display.say,
     )
     state_file.searches = lambda: outcome(controller, thorough=False)
     controller.recall()

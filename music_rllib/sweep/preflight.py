@@ -28,7 +28,6 @@ from music_rllib.errors import BadInputError
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.plan import Plan
-from music_rllib.experiment.scheduler import Scheduler, Status
 from music_rllib.runtime.machine import check_reachable, cluster_address
 from music_rllib.runtime.machine import memory as memory_of_machine
 from music_rllib.runtime.process import early
@@ -197,18 +196,6 @@ def import_checkpoints(plan: Plan, store: NodeStore) -> None:
             for file in ("handoff.json", *(module.file for module in manifest.modules.values())):
                 shutil.copyfile(folder / file, target / file)
             store.publish(source.key, Path(temporary))
-
-
-def verify_inputs(scheduler: Scheduler, store: NodeStore) -> None:
-    """Read the finished nodes from which waiting nodes start.
-
-    Raises:
-        DamagedError: A node differs from its manifest.
-    """
-    waiting = scheduler.having(Status.WAITING)
-    for key in dict.fromkeys(node.input.key for node in waiting if node.input):
-        if store.is_finished(key):
-            store.verify(key)
 
 
 def check_searches(opened: OpenSweep) -> None:

@@ -132,20 +132,21 @@ class Experiment:
 
     # -- finding and creating runs -----------------------------------------------------------
 
-    def find(self, node_key: str, environment: str | None = None) -> KnownRun | None:
+    def find(
+        self, node_key: str, environment: str | None = None, *, again: bool = False
+    ) -> KnownRun | None:
         """The run of a node, or the parent run ("").
 
-        Lists all runs of the sweep on the first call. A run of another environment is deleted (as
-        MLflow deletes runs, so that it can be restored), because a new run replaces it.
+        Lists all runs of the sweep on the first call, and looks for an unknown one `again`. A run
+        of another environment is deleted (it can be restored), because a new run replaces it.
         """
         if self._known is None:
             self._known = self._list()
+        elif again and node_key and node_key not in self._known:
+            self._known |= self._list(f" AND tags.`{names.TAG_NODE_KEY}` = '{node_key}'")
         known = self._known.get(node_key)
-        if (
-            known
-            and environment
-            and known.tags.get(names.TAG_ENVIRONMENT, environment) != (environment)
-        ):
+        found = known.tags.get(names.TAG_ENVIRONMENT) if known else None
+        if environment and found not in (None, environment):
             self.delete(node_key)
             return None
         return known
@@ -182,11 +183,15 @@ class Experiment:
             self._known[node_key] = new
         return new
 
-    def _list(self) -> dict[str, KnownRun]:
-        """The sweep's runs by node key; the older run if two have the same key."""
-        wanted, token = f"tags.`{names.TAG_SWEEP_ID}` = '{self._sweep_id}'", None
+    def look_again(self) -> None:
+        """List the runs again when one is looked for."""
+        self._known = None
+
+    def _list(self, also: str = "") -> dict[str, KnownRun]:
+        """The sweep's runs with a condition, by node key; the older of two with the same key."""
+        wanted, token = f"tags.`{names.TAG_SWEEP_ID}` = '{self._sweep_id}'{also}", None
         known: dict[str, KnownRun] = {}
-        self._earlier = []
+        self._earlier = self._earlier if also else []
         while True:
             page = self.client.search_runs(
                 [self.id],

@@ -130,6 +130,11 @@ class RunQueue:
         """Number of records in the queue."""
         return len(self._records)
 
+    def drop(self) -> None:
+        """Send none of the records in the queue."""
+        with self._lock:
+            self._records.clear()
+
     def cancel(self) -> None:
         """Send nothing after the current request."""
         self._cancelled = True
@@ -159,7 +164,8 @@ class RunQueue:
             tags: Further tags of a run that is created.
         """
         if self._run is None:
-            run = self._experiment.find(self.node_key, self._environment)
+            again = started is None  # another driver may have begun the run meanwhile
+            run = self._experiment.find(self.node_key, self._environment, again=again)
             if run is None:
                 name, time = self._info.name, started or _now()
                 all_tags = {**self._tags(), **tags}

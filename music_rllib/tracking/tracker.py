@@ -16,7 +16,6 @@ import shutil
 import uuid
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import TracebackType
@@ -27,18 +26,13 @@ import yaml
 
 from music_rllib import names
 from music_rllib.command_line import PROGRAM
-from music_rllib.envs.fingerprint import Fingerprint
 from music_rllib.errors import TrackingError
 from music_rllib.experiment.open_sweep import OpenSweep
-from music_rllib.experiment.plan import Node
-from music_rllib.experiment.run_info import RunInfo, run_info
-from music_rllib.experiment.scheduler import Failure, Listener
-from music_rllib.policy.policy import policy_from_folder
+from music_rllib.experiment.run_info import RunInfo
 from music_rllib.redaction import redact, without_secrets
-from music_rllib.store.history import Report, RunResult
-from music_rllib.store.node_store import NodeStore
+from music_rllib.store.history import Report
 from music_rllib.store.serialization import content_key
-from music_rllib.store.storage import StorageError, below
+from music_rllib.store.storage import below
 from music_rllib.tracking.client import (
     Experiment,
     Status,
@@ -68,7 +62,7 @@ class Tracker:
     """Logs one sweep to MLflow.
 
     A tracker that is opened again on the same sweep continues its runs. Several threads may call
-    it, but only one process at a time may track a sweep: the driver's lock ensures it.
+    it. Processes that track the same sweep are opened one after another, and log other runs.
     """
 
     def __init__(
@@ -160,6 +154,16 @@ class Tracker:
             self._experiment.delete(node_key)
         except Exception as error:
             logger.warning("MLflow keeps the earlier run %s: %s", node_key, mlflow_reason(error))
+
+    def leave(self, node_key: str) -> None:
+        """Send nothing more of a run."""
+        if (queue := self._runs.pop(node_key, None)) is not None:
+            queue.drop()
+
+    def look_again(self) -> None:
+        """Send what is waiting, and find the runs that other drivers have created meanwhile."""
+        self._sender.flush(20.0)
+        self._experiment.look_again()
 
     def keep_current(self, node_keys: Iterable[str]) -> None:
         """Mark the runs of these nodes as the sweep's current runs, and all others as earlier."""
@@ -343,57 +347,3 @@ def _as_yaml(settings: Mapping[str, object]) -> str:
     """Settings as a YAML file, without secrets."""
     plain = json.loads(json.dumps(without_secrets(settings), default=str))
     return str(yaml.safe_dump(plain, sort_keys=False, allow_unicode=True))
-
-
-class MlflowListener(Listener):
-    """Logs the runs of a sweep: reports of running ones, and finished ones from the store."""
-
-    def __init__(
-        self, tracker: Tracker, store: NodeStore, environments: Mapping[str, Fingerprint]
-    ) -> None:
-        """Log by `tracker`; `environments` are those of the tasks of running runs."""
-        self.tracker = tracker
-        self._store = store
-        self._environments = environments
-
-    def started(self, node: Node) -> None:
-        """Start the node's MLflow run, or continue an earlier one."""
-        self.tracker.start(run_info(node, self._environments.get(node.run.code)))
-
-    def reported(self, node: Node, reports: list[Report]) -> None:
-        """Log metrics with their original time, so that repeats are identical."""
-        self.tracker.log(node.key, reports)
-
-    def finished(self, node: Node, result: RunResult | None = None) -> None:
-        """Log a run that this sweep or an earlier one has finished, with its policy."""
-        info = run_info(node, self._store.environment(node.key))
-        self.tracker.mirror(info, partial(finished_run, self._store, node))
-
-    def failed(self, node: Node, failure: Failure) -> None:
-        """End the run with its cause."""
-        if not self.tracker.is_running(node.key):
-            self.started(node)
-        self.tracker.end(node.key, "FAILED", {names.TAG_FAILURE: failure.cause})
-
-    def pruned(self, node: Node, reason: str) -> None:
-        """End a run that was stopped early, with the reason."""
-        if self.tracker.is_running(node.key):
-            self.tracker.end(node.key, "KILLED", {names.TAG_PRUNED: reason})
-
-
-def finished_run(store: NodeStore, node: Node) -> StoredRun:
-    """A finished run with its policy, or without one if that cannot be read.
-
-    Raises:
-        DamagedError: The run's history cannot be read.
-    """
-    return StoredRun(store.history(node.key), partial(_policy, store, node))
-
-
-def _policy(store: NodeStore, node: Node) -> bytes | None:
-    try:
-        with store.files(node.key) as folder:
-            return policy_from_folder(folder, [node.run.task]).to_bytes()
-    except (OSError, ValueError, StorageError) as error:
-        logger.warning("MLflow gets no policy of %s: %s", node.label, error)
-        return None

@@ -60,7 +60,6 @@ class RunStorage:
         self._job, self._note = job, note
         self.lease: HeldLease | None = None
         """The run's lease, without which nothing may be written."""
-        self._waits = False
         self._environment: Fingerprint | None = None
         """Fingerprint on this machine, stored with all results; None before the check."""
         self._changes: list[str] = []
@@ -73,7 +72,7 @@ class RunStorage:
 
     @cached_property
     def work(self) -> WorkFolder:
-        """The run's checkpoints. Kept, since its lease file remembers the time of other leases."""
+        """The run's checkpoints."""
         return self.store.work_folder(self._job.key, self._job.checkpoints.keep)
 
     @property
@@ -83,22 +82,15 @@ class RunStorage:
 
     # -- the lease ---------------------------------------------------------------------------
 
-    def acquire(self) -> bool:
-        """Acquire the lease; False if another process has it."""
+    def acquire(self) -> Lease | None:
+        """Acquire the lease and return None, or return the lease of another process."""
         job = self._job
         lease = Lease.of_this_process(f"sweep {job.sweep!r}" if job.sweep else "a run")
         holder = self.work.lease.acquire(lease)
         if holder is None:
             self.lease = HeldLease(self.work.lease, lease)
             self.work.tidy()
-            return True
-        if not self._waits:
-            self._waits = True
-            self._note(
-                f"waits, because {holder} computes it; continues when that process ends or has not "
-                f"renewed its lease for {holder.seconds:.0f} s"
-            )
-        return False
+        return holder
 
     def release(self) -> None:
         """Let other processes compute the run."""
@@ -107,12 +99,13 @@ class RunStorage:
             self.lease = None
             self.work.remove_if_empty()
 
-    def leave_to_others(self) -> None:
-        """Stop using a lease that another process has taken over."""
+    def leave_to_others(self) -> str:
+        """Stop using a lease that another process has taken over; that process, in words."""
         assert self.lease is not None
         self.lease.end()
-        self.lease, self._waits = None, False
+        self.lease = None
         self._note("another process took over while this one was suspended; writing nothing more")
+        return str(self.work.lease.read() or "another process")
 
     def clear(self) -> None:
         """Delete the checkpoints and the lease of a finished run, if this process holds it."""
@@ -156,8 +149,8 @@ class RunStorage:
 
     # -- reading -----------------------------------------------------------------------------
 
-    def finished_history(self) -> list[Report]:
-        """The reports of a finished run.
+    def check_finished(self) -> None:
+        """Check a finished run.
 
         Raises:
             DamagedError: The result is damaged.
@@ -165,7 +158,6 @@ class RunStorage:
         """
         self.store.verify(self._job.key)
         self._refuse_other_environment("result", self.store.environment(self._job.key))
-        return self.store.history(self._job.key)
 
     def source_weights(self) -> NetworkWeights | None:
         """The network weights that the run starts from; None from scratch."""

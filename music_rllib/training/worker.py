@@ -13,6 +13,7 @@ from music_rllib import names
 from music_rllib.redaction import redact
 from music_rllib.store.history import Report, to_json_lines
 from music_rllib.store.lease import LeaseLostError
+from music_rllib.store.patience import be_patient
 from music_rllib.store.storage import StorageError
 from music_rllib.training.failure_reason import cause_of, trace_of
 from music_rllib.training.hang_watch import RECORD, HangWatch, check_hung
@@ -26,12 +27,14 @@ REPORTS, NOTES = "reports", "notes"
 """Keys of a Tune result: new reports as JSON lines, and messages for the user."""
 PAUSED = "paused"
 """Key of a Tune result: environment steps of a run that has reached its job's `until`."""
+LEFT = "left"
+"""Key of a Tune result: the process, in words, that computes the run in place of this one."""
 STOPPED = "stopped"
 """Key of a Tune result: True from a run that was asked to stop and has saved its state."""
 CAUSE, TRACEBACK = "cause", "traceback"
 """Keys of a Tune result: why the run failed. Tune would start a run that raises again."""
 WAIT_SECONDS = 1.0
-"""Time between two looks at a run that another process computes."""
+"""Time between two results of a stopped run."""
 
 
 class RunTrainable(Trainable):
@@ -50,6 +53,7 @@ class RunTrainable(Trainable):
         """Prepare only what can't fail; `step` reports errors with their cause."""
         self._job = NodeJob.from_tune(config)
         self._notes: list[str] = []
+        be_patient(self._job.resources.storage_minutes)
         self._run_storage = RunStorage(self._job, self._notes.append)
         self._stop = StopWatch(self._job.stop_key)
         self._training: TrainingRun | None = None
@@ -88,14 +92,13 @@ class RunTrainable(Trainable):
             # The new owner may have deleted the folder into which this process was writing.
             if self._run_storage.lease is None or not self._run_storage.lease.is_lost():
                 raise
-        # Wait for the new owner to finish the run.
         self._end_watch()
-        self._run_storage.leave_to_others()
-        if self._training is not None:
-            self._training.close()
-        self._training = None
-        self._history, self._unsent, self._seconds_before = [], 0, 0.0
-        return self._result(done=False)
+        return self._left(self._run_storage.leave_to_others())
+
+    def _left(self, holder: str) -> dict[str, Any]:
+        """The result of a run that another process computes; its CPUs are free for another one."""
+        self._unsent = len(self._history)
+        return self._result(done=True) | {LEFT: holder}
 
     def _step(self) -> dict[str, Any]:
         if self._stopped:
@@ -107,9 +110,8 @@ class RunTrainable(Trainable):
             if self._stop.asked():
                 self._stopped = True
                 return self._result(done=False)
-            if not self._run_storage.acquire():
-                time.sleep(WAIT_SECONDS)
-                return self._result(done=False)
+            if (holder := self._run_storage.acquire()) is not None:
+                return self._left(str(holder))
             if self._run_storage.store.is_finished(self._job.key):  # meanwhile
                 return self._finished_elsewhere()
             self._training = self._begin()
@@ -133,9 +135,9 @@ class RunTrainable(Trainable):
 
     def _finished_elsewhere(self) -> dict[str, Any]:
         """The result of a run that another process has finished."""
-        self._history = self._run_storage.finished_history()
+        self._run_storage.check_finished()
         self._run_storage.clear()
-        return self._result(done=True)
+        return self._left("another process, which has finished it")
 
     def _result(self, *, done: bool) -> dict[str, Any]:
         """A Tune result with all reports and notes that the driver does not have.

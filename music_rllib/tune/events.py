@@ -17,11 +17,11 @@ from music_rllib.experiment.scheduler import Failure, Listener, Scheduler
 from music_rllib.redaction import redact
 from music_rllib.store.history import from_json_lines
 from music_rllib.store.node_store import NodeStore
-from music_rllib.store.storage import DamagedError
+from music_rllib.store.storage import StorageError
 from music_rllib.training.failure_reason import cause_of
 from music_rllib.training.hang_watch import RECORD
 from music_rllib.training.job import NodeJob
-from music_rllib.training.worker import CAUSE, NOTES, PAUSED, REPORTS, TRACEBACK
+from music_rllib.training.worker import CAUSE, LEFT, NOTES, PAUSED, REPORTS, TRACEBACK
 
 RESTARTS = 3
 """Restarts of a run whose worker dies. A run that raises an error fails at once."""
@@ -50,6 +50,8 @@ class TuneEvents(Callback):
         self._store = store
         self._listeners = list(listeners)
         self._failures = failures
+        self._deaths: dict[str, list[str]] = {}
+        """Tracebacks of a node's workers that died, over all of its trials."""
 
     def __getstate__(self) -> dict[str, Any]:
         # Tune pickles its callbacks into a snapshot that is never read.
@@ -73,7 +75,7 @@ class TuneEvents(Callback):
                 listener.reported(node, reports)
 
     def on_trial_complete(self, *, trial: Trial, **_: Any) -> None:
-        """The trial ended: it failed, paused, or published its result."""
+        """The trial ended: it failed, paused, published its result, or left it to others."""
         try:
             self._complete(self._node(trial), trial)
         finally:
@@ -88,9 +90,18 @@ class TuneEvents(Callback):
             for listener in self._listeners:
                 listener.paused(node)
             return
+        if (holder := trial.last_result.get(LEFT)) is not None:
+            # The next worker finds the lease of a dead one on another machine, and leaves the run.
+            if len(deaths := self._deaths.get(node.key, [])) > RESTARTS:
+                self._fail(node, cause_of(None, deaths[-1]), deaths[-1])
+                return
+            self._scheduler.leave(node.key)
+            for listener in self._listeners:
+                listener.left(node, holder)
+            return
         try:
             result = self._store.result(node.key)
-        except DamagedError as error:
+        except (StorageError, OSError) as error:
             self._fail(node, str(error), str(error))
             return
         assert result is not None, "a run publishes its result"
@@ -107,13 +118,14 @@ class TuneEvents(Callback):
 
     def on_trial_recover(self, *, trial: Trial, **_: Any) -> None:
         """The trial's worker died, and another worker resumes the run."""
-        text = _COLOR.sub("", _text_of(trial))
+        text, node = _COLOR.sub("", _text_of(trial)), self._node(trial)
+        deaths = self._deaths.setdefault(node.key, [])
+        deaths.append(text)
         cause = redact(cause_of(_error_of(trial), text)).splitlines()[0]
         text = (
             f"{cause} Another worker resumes from the last checkpoint "
-            f"({trial.run_metadata.num_failures} of {RESTARTS} times)."
+            f"({len(deaths)} of {RESTARTS} times)."
         )
-        node = self._node(trial)
         if self._store.work_folder(node.key).folder.read(RECORD) is not None:
             text = "its environment hangs, so its worker was ended; the next worker names the call"
         for listener in self._listeners:

@@ -5,21 +5,26 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import shutil
+import time
 from collections.abc import Callable, Iterator, Sequence
+from itertools import count
 from pathlib import Path
 from typing import Any, Protocol
 
 from ray import tune
 from ray.tune.experiment import Trial
+from ray.tune.schedulers import FIFOScheduler
 from ray.tune.search import Searcher
 
+from music_rllib.command_line import how_to_continue
+from music_rllib.errors import one_line
 from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.scheduler import Listener, Scheduler, Status
 from music_rllib.runtime.machine import cluster_address, own_folder
 from music_rllib.runtime.ray_cluster import cluster
-from music_rllib.store.storage import below, encoded
+from music_rllib.store.lease import LeaseFile
+from music_rllib.store.storage import StorageError, is_remote
 from music_rllib.training.job import NodeJob
 from music_rllib.training.worker import RunTrainable
 from music_rllib.tune.events import RESTARTS, TuneEvents
@@ -37,12 +42,77 @@ class Searches(Protocol):
         """Whether no more runs will be added."""
 
 
+LOCAL_SECONDS, REMOTE_SECONDS = 5.0, 15.0
+"""Seconds between two looks at the runs of other processes, in a folder and in a bucket."""
+WAIT_SECONDS = 1.0
+"""Time between two looks for a run of a driver that has none to compute."""
+
+
+class SharedRuns:
+    """The runs of a sweep that other processes compute in the same storage, or have finished."""
+
+    def __init__(self, sweep: OpenSweep, listeners: Sequence[Listener]) -> None:
+        """Tell `listeners` about runs of `sweep` that other processes have."""
+        self._sweep, self._listeners = sweep, listeners
+        self._leases: dict[str, LeaseFile] = {}
+        """Leases of others by node key; each remembers since when it has not been renewed."""
+        self._seconds = REMOTE_SECONDS if is_remote(sweep.storage) else LOCAL_SECONDS
+        self._looked = time.monotonic()
+
+    def look(self) -> None:
+        """Regularly look for runs that other processes have finished, or have left."""
+        scheduler, now = self._sweep.scheduler, time.monotonic()
+        if now - self._looked < self._seconds:
+            return
+        self._looked = now
+        waiting = scheduler.having(Status.WAITING)
+        finished = self._sweep.store.finished(node.key for node in waiting)
+        for node in waiting:
+            # The results of others may have ended the trial that wanted it.
+            if node.key in finished and scheduler[node.key] is Status.WAITING:
+                self._take_over(node)
+        for node in scheduler.elsewhere:
+            if self.is_free(node):
+                scheduler.take_back(node.key)
+
+    def is_free(self, node: Node) -> bool:
+        """Whether no other process computes a waiting node or has finished it."""
+        if self._sweep.store.is_finished(node.key) and self._take_over(node):
+            return False
+        work = self._sweep.store.work_folder(node.key)
+        lease = self._leases.setdefault(node.key, work.lease)
+        if (holder := lease.holder()) is None:
+            lease.remove_invalid()
+            del self._leases[node.key]
+            return True
+        if node not in self._sweep.scheduler.elsewhere:
+            self._sweep.scheduler.leave(node.key)
+            for listener in self._listeners:
+                listener.left(node, str(holder))
+        return False
+
+    def _take_over(self, node: Node) -> bool:
+        """Use the result of another process; False if a worker has to report what is wrong."""
+        store, code = self._sweep.store, node.run.code
+        if not store.is_sound(node.key):
+            return False
+        result = store.result(node.key)
+        differences = self._sweep.environments.differences(code, store.environment(node.key))
+        if result is None or differences:
+            return False
+        self._leases.pop(node.key, None)
+        self._sweep.scheduler.finish(node.key)
+        for listener in self._listeners:
+            listener.finished(node, result)
+        return True
+
+
 class DagSearcher(Searcher):
     """Suggests each waiting node of a plan to Tune, once its input is published.
 
-    Tune asks whenever it has room for a trial. After `None` it continues with its trials; without
-    any it asks again after a second, which only happens while a search waits for the trials of
-    another driver. After `FINISHED` it never asks again. A failed run does not stop the others.
+    Tune asks whenever it has room for a trial. After `None` it continues with its trials, after
+    `FINISHED` it never asks again. A driver with no trials waits outside Tune, which would keep
+    the processes of ended trials. A failed run does not stop the others.
     """
 
     def __init__(
@@ -51,6 +121,7 @@ class DagSearcher(Searcher):
         config_of: Callable[[Node], dict[str, Any]],
         searches: Searches | None = None,
         stopped: Callable[[], bool] = lambda: False,
+        shared: SharedRuns | None = None,
     ) -> None:
         """Suggest the nodes of `scheduler`.
 
@@ -59,23 +130,40 @@ class DagSearcher(Searcher):
             config_of: Makes the Tune config of a node.
             searches: Add nodes to the scheduler.
             stopped: Returns whether the sweep was stopped.
+            shared: The runs of other processes.
         """
         super().__init__()
         self._scheduler = scheduler
         self._config_of = config_of
         self._searches = searches
         self._stopped = stopped
+        self._shared = shared
+
+    @property
+    def over(self) -> bool:
+        """Whether no node is left to compute, here or elsewhere."""
+        searched = self._searches is None or self._searches.over
+        return self._scheduler.all_handed_out and searched
+
+    def next(self) -> Node | None:
+        """The next node that this process can compute; None if there is none now."""
+        if self._shared is not None:
+            self._shared.look()
+        while True:
+            if self._searches is not None:
+                self._searches.propose()
+            node = self._scheduler.next_ready()
+            if node is None or self._shared is None or self._shared.is_free(node):
+                return node
 
     def suggest(self, trial_id: str) -> dict[str, Any] | str | None:
         """The config of a node that can run, None for "not now", or `FINISHED`."""
         if self._stopped():
             return str(Searcher.FINISHED)
-        if self._searches is not None:
-            self._searches.propose()
-        node = self._scheduler.next_ready()
+        node = self.next()
         if node is None:
-            over = self._searches is None or self._searches.over
-            return str(Searcher.FINISHED) if self._scheduler.all_handed_out and over else None
+            waits = not self.over and self._scheduler.having(Status.STARTED)
+            return None if waits else str(Searcher.FINISHED)
         self._scheduler.start(node.key)
         return self._config_of(node)
 
@@ -134,46 +222,92 @@ def compute(
         ).to_tune(),
         searches=searches,
         stopped=lambda: stopping.received is not None,
+        shared=SharedRuns(sweep, listeners),
     )
     with (
         cluster(resources) as capacity,
-        _tune_folder(sweep) as folder,
+        # Tune's files are never read. Not in the storage: if that is full, or does not answer,
+        # Tune must not stop the runs.
+        own_folder("music-tune-") as folder,
         _quiet_tune(capacity.waiting),
         stopping,
     ):
         if capacity.remark is not None:
             for listener in listeners:
                 listener.remarked(capacity.remark)
-        tuner = tune.Tuner(
-            RunTrainable,
-            tune_config=tune.TuneConfig(
-                search_alg=searcher,
-                # As many as the searcher suggests; -1 means no limit.
-                num_samples=-1 if searches else len(sweep.scheduler.having(Status.WAITING)),
-                reuse_actors=_may_share_processes(sweep),
-                trial_name_creator=_trial_name,
-                trial_dirname_creator=_trial_name,
-            ),
-            run_config=tune.RunConfig(
-                name="tune",
-                storage_path=folder,
-                verbose=0,
-                callbacks=[events, stopping],
-                # For workers that die; errors of a run are in its result.
-                failure_config=tune.FailureConfig(max_failures=RESTARTS),
-                # The trainable writes its own checkpoints.
-                checkpoint_config=tune.CheckpointConfig(checkpoint_at_end=False),
-            ),
-        )
-        try:
-            tuner.fit()
-        except FileNotFoundError:
-            # Ray deletes the working folder of a stopped job before its driver has ended, and Tune
-            # needs one for a summary that is never read.
-            if stopping.received is None or _has_working_folder():
-                raise
+        for number in count():
+            if not _wait_for_a_run(searcher, stopping, listeners):
+                break
+            tuner = tune.Tuner(
+                RunTrainable,
+                tune_config=tune.TuneConfig(
+                    search_alg=searcher,
+                    num_samples=-1,  # as many as the searcher suggests
+                    scheduler=_Scheduler(),
+                    reuse_actors=_may_share_processes(sweep),
+                    trial_name_creator=_trial_name,
+                    trial_dirname_creator=_trial_name,
+                ),
+                run_config=tune.RunConfig(
+                    name=f"tune{number}",
+                    storage_path=folder,
+                    verbose=0,
+                    callbacks=[events, stopping],
+                    # For workers that die; errors of a run are in its result.
+                    failure_config=tune.FailureConfig(max_failures=RESTARTS),
+                    # The trainable writes its own checkpoints.
+                    checkpoint_config=tune.CheckpointConfig(checkpoint_at_end=False),
+                ),
+            )
+            try:
+                tuner.fit()
+            except Exception as error:
+                if stopping.received is not None and not _has_working_folder():
+                    # Ray deletes the folder of a stopped job before its driver has ended, and Tune
+                    # needs one for a summary that is never read.
+                    break
+                if (cause := _file_error(error)) is None:
+                    raise
+                raise StorageError(
+                    "the storage and the folder for temporary files must answer, got "
+                    f"{one_line(cause)}. Finished runs and the last checkpoints are kept. "
+                    f"{how_to_continue()}"
+                ) from error
     done = sweep.scheduler.complete and (searches is None or searches.over)
     return None if done else stopping.received
+
+
+def _wait_for_a_run(
+    searcher: DagSearcher, stopping: StopSignals, listeners: Sequence[Listener]
+) -> bool:
+    """Wait until this process can compute a run; False if none is left, or after a signal."""
+    while not searcher.over and stopping.received is None:
+        if searcher.next() is not None:
+            return True
+        time.sleep(WAIT_SECONDS)
+        for listener in listeners:
+            listener.tick()
+    return False
+
+
+def _file_error(error: BaseException | None) -> BaseException | None:
+    """The error of a file system that led to an error of Tune, if there is one."""
+    while error is not None and not isinstance(error, OSError | StorageError):
+        error = error.__cause__ or error.__context__
+    return error
+
+
+class _Scheduler(FIFOScheduler):
+    """Tune's order, without the idle process that Tune keeps for a next trial.
+
+    On a cluster, another driver may wait for its CPUs.
+    """
+
+    def choose_trial_to_run(self, tune_controller: Any) -> Trial | None:
+        chosen = super().choose_trial_to_run(tune_controller)
+        if chosen is None and cluster_address() is not None:
+            tune_controller._tune_controller._cleanup_cached_actors(force_all=True)
+        return chosen
 
 
 def _may_share_processes(sweep: OpenSweep) -> bool:
@@ -197,21 +331,6 @@ def _has_working_folder() -> bool:
 def _trial_name(trial: Trial) -> str:
     # A node that a search continues is another trial of Tune.
     return f"{NodeJob.from_tune(trial.config).key}-{trial.trial_id}"
-
-
-@contextlib.contextmanager
-def _tune_folder(sweep: OpenSweep) -> Iterator[str]:
-    """A folder for Tune's files, which are never read; every machine of the cluster reaches it."""
-    if cluster_address() is None:
-        # Not in the storage: if that is full, Tune must not stop the runs.
-        with own_folder("music-tune-") as folder:
-            yield folder
-        return
-    if "://" in sweep.storage:
-        yield encoded(below(sweep.storage, sweep.plan.name))
-        return
-    yield str(sweep.folder)
-    shutil.rmtree(sweep.folder / "tune", ignore_errors=True)
 
 
 _LOGGERS = ("ray.tune.tune", "ray.tune.analysis.experiment_analysis")

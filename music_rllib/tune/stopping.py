@@ -74,6 +74,8 @@ class StopSignals(tune.Callback):
             early.install()
             early.check()
             self._handlers_before = {number: signal.getsignal(number) for number in SIGNALS}
+            for number in SIGNALS:
+                signal.signal(number, self._stop)
         threading.Thread(target=self._watch_ray, name="ray-watch", daemon=True).start()
 
     def __exit__(self, *_: object) -> None:

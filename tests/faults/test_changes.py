@@ -4,24 +4,27 @@ from __future__ import annotations
 
 import os
 import signal
-import time
-from collections.abc import Callable
+import threading
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
+from ray.tune.search import Searcher
 
 from music_rllib.config.load import load_config
 from music_rllib.config.schema import SweepConfig
+from music_rllib.errors import BadInputError
 from music_rllib.experiment.open_sweep import OpenSweep, open_sweep
-from music_rllib.experiment.plan import continuation_key, make_plan
+from music_rllib.experiment.plan import Node, continuation_key, make_plan
 from music_rllib.experiment.record import changes_since, continued_runs_text, keep_record
+from music_rllib.experiment.scheduler import Listener
 from music_rllib.store import lease as lease_module
 from music_rllib.store.history import RunResult
 from music_rllib.store.lease import Lease, LeaseFile
-from music_rllib.store.storage import StorageError, open_storage
-from music_rllib.sweep.driver_lock import hold_driver_lock
+from music_rllib.store.storage import open_storage
+from music_rllib.sweep.driver_lock import alone, driving
+from music_rllib.tune.runner import DagSearcher, SharedRuns
 
 RESULT = RunResult(label="l", env_steps=1200, seconds=1.0, metrics={})
 
@@ -159,57 +162,86 @@ def test_accepted_changes_are_trained(sweep_program: Any, sweep_document: dict[s
     assert len(list((sweep_program.folder / "results" / "nodes").iterdir())) == 2
 
 
-def test_a_second_driver_is_refused_and_a_dead_one_does_not_count(
+def test_drivers_know_of_each_other_and_not_of_a_dead_one(
     tmp_path: Path, sweep_document: dict[str, Any]
 ) -> None:
     sweep = opened(tmp_path, sweep_document)
-    file = LeaseFile(open_storage(str(sweep.folder)), "driver.json")
-    theirs = Lease.of_this_process("sweep 'points'")
-    assert file.acquire(theirs) is None
-    match = rf"points must be used by one process at a time.*\(process {os.getpid()} on "
-    with pytest.raises(StorageError, match=match), hold_driver_lock(sweep):
-        pass
-    file.release(theirs.owner)
-
+    with driving(sweep.storage, "points") as one:
+        one.check_alone()
+        with driving(sweep.storage, "points") as other:
+            assert [lease.owner for lease in one.others()] == [other.owner]
+            match = rf"got sweep 'points' \(process {os.getpid()} on .*: stop it first"
+            with pytest.raises(BadInputError, match=match):
+                one.check_alone()
     child = os.fork()
     if child == 0:
-        file.acquire(Lease.of_this_process("sweep 'points'"))
-        os.kill(os.getpid(), signal.SIGKILL)
+        with driving(sweep.storage, "points"), alone(sweep.storage, "points", print):
+            os.kill(os.getpid(), signal.SIGKILL)
     os.waitpid(child, 0)
-    assert file.read() is not None
-    with hold_driver_lock(sweep):
-        assert file.is_owned_by(str(getattr(file.read(), "owner", None)))
-    assert file.read() is None
+    with driving(sweep.storage, "points") as one, alone(sweep.storage, "points", print) as waited:
+        assert (one.others(), waited) == ([], False)
 
 
-def test_a_suspended_driver_exits_if_another_one_has_its_sweep(
+def test_drivers_prepare_one_after_another(
     tmp_path: Path, sweep_document: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It continues if the other driver has ended."""
-    monkeypatch.setattr(lease_module, "EXPIRES_SECONDS", 0.4)
+    monkeypatch.setattr("music_rllib.sweep.driver_lock.WAIT_SECONDS", 0.05)
     sweep = opened(tmp_path, sweep_document)
-    file = LeaseFile(open_storage(str(sweep.folder)), "driver.json")
-    ended: list[int] = []
     said: list[str] = []
-    monkeypatch.setattr("music_rllib.sweep.driver_lock.end_process", ended.append)
-    theirs = Lease.of_this_process("sweep 'points'", 60.0)
-    with hold_driver_lock(sweep, said.append):
-        mine = file.read()
-        assert mine is not None
-        file.release(mine.owner)
-        wait_until(lambda: file.read() is not None)
-        again = file.read()
-        assert again is not None
-        assert (again.owner != mine.owner, ended) == (True, [])
-        Path(file.path).write_text(theirs.model_dump_json())
-        wait_until(lambda: bool(ended))
-    assert ended == [1]
-    assert "points has been taken over by sweep 'points'" in said[0]
-    assert file.is_owned_by(theirs.owner)
+    with alone(sweep.storage, "points", said.append) as waited:
+        assert not waited
+        file = LeaseFile(open_storage(sweep.storage) / "points", "driver.json")
+        theirs = file.read()
+        assert theirs is not None
+        threading.Timer(0.2, file.release, [theirs.owner]).start()
+        with alone(sweep.storage, "points", said.append) as waited:
+            assert waited
+    assert said == [f"waits for {theirs}, which prepares or ends"]
 
 
-def wait_until(happened: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 30
-    while not happened():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+class Seen(Listener):
+    """Labels of the runs that other processes computed and finished."""
+
+    def __init__(self) -> None:
+        self.events: list[str] = []
+
+    def left(self, node: Node, holder: str) -> None:
+        self.events.append(f"{node.label} left to {holder.partition(' (')[0]}")
+
+    def finished(self, node: Node, result: RunResult) -> None:
+        self.events.append(f"{node.label} finished")
+
+
+def test_a_driver_takes_the_next_free_run(
+    tmp_path: Path, sweep_document: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It waits for a parent that is trained elsewhere, and takes over from a dead process."""
+    sweep_document["seeds"] = [0, 1]
+    sweep, seen = opened(tmp_path, sweep_document), Seen()
+    shared = SharedRuns(sweep, [seen])
+    shared._seconds = 0.0
+    searcher = DagSearcher(sweep.scheduler, lambda node: {"label": node.label}, shared=shared)
+    theirs, mine = (node for node in sweep.plan.nodes if node.stage == "pretrain")
+    other = Lease.of_this_process("sweep 'other'", 3600.0)  # its clock is fast
+    other = other.model_copy(update={"machine": "another", "pid": 7})
+    lease = sweep.store.work_folder(theirs.key).lease
+    assert lease.acquire(other) is None
+    assert searcher.suggest("1") == {"label": mine.label}
+    assert searcher.suggest("2") is None, "it continues with its trial"
+    sweep.scheduler.fail(mine.key)
+    assert searcher.suggest("3") == Searcher.FINISHED, "it leaves Tune, and holds no CPU"
+    assert not searcher.over
+    assert searcher.next() is None
+    (tmp_path / "made").mkdir()
+    sweep.store.publish(theirs.key, tmp_path / "made", RESULT)
+    node = searcher.next()
+    assert node is not None
+    assert (node.stage, node.run.seed) == ("finetune", 0)
+    assert seen.events == [f"{theirs.label} left to sweep 'other'", f"{theirs.label} finished"]
+    assert sweep.store.work_folder(node.key).lease.acquire(other) is None
+    (second,) = {one["label"] for _ in range(3) if isinstance(one := searcher.suggest(""), dict)}
+    assert second != node.label
+    monkeypatch.setattr(lease_module, "EXPIRES_SECONDS", 0.0)
+    assert searcher.next() == node, "its lease is not renewed"
+    worker = sweep.store.work_folder(node.key).lease
+    assert worker.acquire(Lease.of_this_process("mine")) is None, "it need not watch it"

@@ -19,11 +19,10 @@ import pytest
 
 from music_rllib.config.schema import Checkpoints
 from music_rllib.envs.tasks import Task
-from music_rllib.store import lease as lease_module
 from music_rllib.store.lease import Lease
 from music_rllib.store.node_store import NodeStore
 from music_rllib.training.job import NodeJob
-from music_rllib.training.worker import CAUSE, NOTES, STOPPED, RunTrainable
+from music_rllib.training.worker import CAUSE, LEFT, NOTES, STOPPED, RunTrainable
 from tests.integration.sweep.test_sweep_trainable import (
     compute,
     job,
@@ -184,43 +183,16 @@ def test_a_run_refuses_a_damaged_handoff(tmp_path: Path) -> None:
     assert compute(node)[-1].get(CAUSE) is None, "an intact handoff is used"
 
 
-def test_a_run_of_another_process_is_waited_for(
-    cut: tuple[Path, Path, NodeJob], tmp_path: Path
-) -> None:
+def test_a_worker_leaves_a_run_of_another_process(tmp_path: Path) -> None:
     """A worker that outlived its driver, or another sweep, is not disturbed or repeated."""
-    whole, _, _ = cut
     node = job(tmp_path, settings("tac"))
-    store = NodeStore(str(tmp_path))
     theirs = Lease.of_this_process("sweep 'other'").model_copy(
         update={"machine": "another", "host": "far-away", "pid": 77}
     )
-    file = store.work_folder(node.key).lease
-    assert file.acquire(theirs) is None
-    trial = RunTrainable(config=node.to_tune())
-    first, second = trial.train(), trial.train()
-    assert "sweep 'other' (process 77 on far-away" in first[NOTES][0]
-    assert (second[NOTES], second["reports"], second["done"]) == ([], "", False)
-    shutil.copytree(whole / "nodes", tmp_path / "nodes")
-    last = trial.train()
-    assert last["done"]
-    assert len(last["reports"].splitlines()) == 4
-    trial.stop()
-
-
-def test_a_dead_owner_with_a_fast_clock_is_not_waited_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    node = job(tmp_path, settings("tac"))
-    theirs = Lease.of_this_process("sweep 'other'", 3600.0).model_copy(
-        update={"machine": "another", "host": "far-away", "pid": 77}
-    )
     assert NodeStore(str(tmp_path)).work_folder(node.key).lease.acquire(theirs) is None
-    monkeypatch.setattr(lease_module, "EXPIRES_SECONDS", 1.0)
-    trial = RunTrainable(config=node.to_tune())
-    waiting, *_, last = (trial.train() for _ in range(4))
-    assert "waits, because sweep 'other'" in waiting[NOTES][0]
-    assert last["reports"], "it computes"
-    trial.stop()
+    (result,) = compute(node)
+    assert "sweep 'other' (process 77 on far-away" in result[LEFT]
+    assert (result["reports"], result["done"]) == ("", True)
 
 
 def test_a_worker_that_lost_its_lease_stops_writing_and_reuses(
@@ -236,19 +208,17 @@ def test_a_worker_that_lost_its_lease_stops_writing_and_reuses(
     before = work.names()
     theirs = Lease.of_this_process("sweep 'other'")
     Path(work.lease.path).write_text(theirs.model_dump_json())
-    results = [trial.train(), trial.train()]
-    notes = [note for result in results for note in result[NOTES]]
-    assert "another process took over while this one was suspended" in notes[0]
-    assert "waits, because sweep 'other'" in notes[1]
-    assert not any(result["done"] for result in results)
+    result = trial.train()
+    trial.stop()
+    assert "another process took over while this one was suspended" in result[NOTES][0]
+    assert "sweep 'other'" in result[LEFT]
+    assert (result["done"], result["reports"]) == (True, "")
     assert work.names() == before
     assert work.lease.is_owned_by(theirs.owner)
     shutil.copytree(whole / "nodes", tmp_path / "nodes")
     work.clear()
-    last = trial.train()
-    assert (last["done"], last.get(CAUSE)) == (True, None)
-    assert len(last["reports"].splitlines()) == 4
-    trial.stop()
+    (last,) = compute(node)
+    assert (last["done"], last.get(CAUSE), LEFT in last) == (True, None, True)
     assert not list((tmp_path / "work").iterdir())
 
 
@@ -267,11 +237,10 @@ def test_a_worker_whose_lease_nobody_took_continues(
         Path(work.lease.path).unlink()
     else:
         shutil.rmtree(work.folder.path)
-    result: dict[str, Any] = {"done": False}
-    while not result["done"]:
-        result = trial.train()
+    assert LEFT in trial.train()
     trial.stop()
-    assert result.get(CAUSE) is None
+    *_, last = compute(node)
+    assert last.get(CAUSE) is None
     assert numbers(tmp_path, node) == numbers(whole, node)
 
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import random
 import re
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -13,7 +16,7 @@ import pytest
 
 from music_rllib.tune.events import RESTARTS
 from tests.faults import comparison, sweeps
-from tests.integration.conftest import Program
+from tests.integration.conftest import REPOSITORY, Program
 
 
 @pytest.mark.thorough
@@ -129,3 +132,60 @@ def test_killed_twenty_times_at_random_moments(program: Program, unbroken: Path)
         results.rename(program.folder / f"done-{kills}")  # again, from scratch
     sweeps.finish(program)
     comparison.same(unbroken, results)
+
+
+@pytest.mark.thorough
+def test_an_array_of_tasks_is_stopped_killed_and_requeued(
+    program: Program, unbroken: Path, tmp_path: Path
+) -> None:
+    """`cluster/slurm.sh` with three tasks: one gets SIGTERM, one is killed, one stays."""
+    stubs = tmp_path / "stubs"
+    stubs.mkdir()
+    python = f'#!/bin/sh\nexec {sys.executable} -m music_rllib "$@"\n'
+    requeue = f'#!/bin/sh\necho "$@" >> {tmp_path}/requeued\n'
+    for name, script in (("music-rllib", python), ("scontrol", requeue)):
+        (stubs / name).write_text(script)
+        (stubs / name).chmod(0o755)
+
+    def task(number: int) -> subprocess.Popen[bytes]:
+        environment = program.environment | {
+            "PATH": f"{stubs}:{os.environ['PATH']}",
+            "SLURM_JOB_ID": str(number),
+            "SLURM_CPUS_PER_TASK": "1",
+        }
+        with (tmp_path / f"{number}.log").open("ab") as log:
+            return subprocess.Popen(
+                ["sh", REPOSITORY / "cluster/slurm.sh", program.file, "--storage", "results"],
+                cwd=program.folder,
+                env=environment,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+            )
+
+    def with_sign(sign: str) -> int:
+        """The task whose log has `sign`."""
+        deadline = time.monotonic() + sweeps.FIRST_SIGN
+        while time.monotonic() < deadline:
+            for log in tmp_path.glob("*.log"):
+                if sign in log.read_text():
+                    return int(log.stem)
+            time.sleep(0.1)
+        raise AssertionError(f"no {sign} in {tmp_path}")
+
+    tasks = {number: task(number) for number in (1, 2, 3)}
+    try:
+        first = with_sign("pretrain/seed0: 0 of 4,000 env steps")
+        tasks[first].terminate()
+        assert tasks[first].wait(sweeps.PATIENCE) == 128 + signal.SIGTERM
+        assert (tmp_path / "requeued").read_text() == f"requeue {first}\n"
+        second = with_sign("pretrain/seed0: continues at ")
+        os.killpg(tasks[second].pid, signal.SIGKILL)
+        tasks[second].wait()
+        tasks |= {number: task(number) for number in (first, second)}
+        assert [one.wait(sweeps.PATIENCE) for one in tasks.values()] == [0, 0, 0]
+    finally:
+        for one in tasks.values():
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(one.pid, signal.SIGKILL)
+    comparison.same(unbroken, program.folder / "results")

@@ -48,14 +48,16 @@ def let_expire(*leases: Path) -> None:
         lease.write_text(json.dumps(content | {"expires": time.time() - 1}))
 
 
-def test_a_suspended_sweep_waits_for_the_new_owner_of_its_runs(
-    program: Program, other: sweeps.OwnProgram, unbroken: Path, tmp_path: Path
+@pytest.mark.parametrize("name", ["second", "points"])
+def test_a_suspended_sweep_leaves_its_run_to_the_new_owner(
+    name: str, program: Program, other: sweeps.OwnProgram, unbroken: Path, tmp_path: Path
 ) -> None:
+    """The new owner is another sweep, or another driver of the same one."""
     process = sweeps.start_until(program, "pretrain/seed0: started")
     (lease,) = wait_for_lease(tmp_path / "results")
     signal_all(process, signal.SIGSTOP)
     let_expire(lease)
-    second = other.start("--name", "second")
+    second = other.start("--name", name)
     sweeps.read_until(second, "pretrain/seed0: ")
     signal_all(process, signal.SIGCONT)
     output, errors = process.communicate(timeout=sweeps.PATIENCE)
@@ -64,24 +66,8 @@ def test_a_suspended_sweep_waits_for_the_new_owner_of_its_runs(
     output, errors = second.communicate(timeout=sweeps.PATIENCE)
     assert second.returncode == 0, output + errors
     comparison.same(unbroken, tmp_path / "results")
-    theirs = comparison.logged(f"sqlite:///{other.folder}/mlflow.db", "second")
+    theirs = comparison.logged(f"sqlite:///{other.folder}/mlflow.db", name)
     assert theirs == comparison.logged(f"sqlite:///{unbroken}/mlflow.db")
-
-
-def test_a_suspended_driver_continues_if_nobody_took_its_sweep(
-    program: Program, other: sweeps.OwnProgram, unbroken: Path, tmp_path: Path
-) -> None:
-    """A second driver finds the lease expired, and is refused by the lock of MLflow's records."""
-    process = sweeps.start_until(program, "pretrain/seed0: started")
-    wait_for_lease(tmp_path / "results")
-    signal_all(process, signal.SIGSTOP)
-    let_expire(tmp_path / "results" / "points" / "driver.json")
-    code, output, errors = other.run()
-    assert code == 2, output + errors
-    signal_all(process, signal.SIGCONT)
-    output, errors = process.communicate(timeout=sweeps.PATIENCE)
-    assert process.returncode == 0, output + errors
-    comparison.same(unbroken, tmp_path / "results")
 
 
 def wait_for_lease(storage: Path) -> list[Path]:

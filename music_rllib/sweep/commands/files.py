@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -115,12 +116,18 @@ def clean(
     """
     from music_rllib.experiment.sweep_files import find_sweep
     from music_rllib.sweep.clean import find_deletable
+    from music_rllib.sweep.driver_lock import alone
 
     location = find_sweep(sweep, storage)
-    cleaning = find_deletable(location, unfinished=unfinished or everything, everything=everything)
+    say = console_for(as_json=json).print
+    # No driver may start meanwhile.
+    with alone(location.storage, location.name, say) if yes else nullcontext():
+        cleaning = find_deletable(
+            location, unfinished=unfinished or everything, everything=everything
+        )
+        if yes:
+            cleaning.delete()
     items = cleaning.items
-    if yes:
-        cleaning.delete()
     if json:
         answer = {"sweep": location.name, "deleted": yes, "items": items, "kept": cleaning.kept}
         print_json(answer)

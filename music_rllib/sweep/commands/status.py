@@ -130,22 +130,24 @@ def stop(
     """
     from music_rllib.experiment import sweep_files
     from music_rllib.experiment.sweep_files import find_sweep
-    from music_rllib.sweep.driver_lock import has_driver
+    from music_rllib.sweep.driver_lock import drivers_of
 
     location = find_sweep(sweep, storage)
     name = location.name
     console = console_for(as_json=json)
+
     state = state_of(location)["state"]
     deadline = time.monotonic() + wait
-    while state != "running" and has_driver(location.storage, name) and time.monotonic() < deadline:
+    while state != "running" and drivers_of(location.storage, name) and time.monotonic() < deadline:
         time.sleep(0.5)  # the sweep is starting
         state = state_of(location)["state"]
     was_running = state == "running"
     if was_running:
-        location.write(sweep_files.STOP, '{"stop": true}')
+        location.write(sweep_files.STOP, sweep_files.as_json({"stop": time.time_ns()}))
         while state == "running" and time.monotonic() < deadline:
             time.sleep(0.5)
-            state = state_of(location)["state"]
+            if not drivers_of(location.storage, name):
+                state = state_of(location)["state"]
         console.print(f"{name}: {'was told to stop' if state == 'running' else 'has stopped'}")
     else:
         console.print(f"{name}: is not running ({state})")

@@ -106,6 +106,8 @@ class Display(Listener):
         """Node key to the time of its last line."""
         self._print_all = os.environ.get(names.VARIABLE_PROGRESS) == "all"
         self._refreshed = self._headed = self._began
+        self._shares = False
+        """Whether the screen says that other processes compute runs too."""
         self._live = Live(console=console, auto_refresh=False, transient=True)
 
     def __enter__(self) -> Self:
@@ -169,6 +171,12 @@ class Display(Listener):
         self._leave(node)
 
     def pruned(self, node: Node, reason: str) -> None:
+        self._leave(node)
+
+    def left(self, node: Node, holder: str) -> None:
+        if not self._shares or node.key in self._running:
+            self._shares = True
+            self._say_of(node, f"computed by {holder}; this process takes runs that are free")
         self._leave(node)
 
     def _leave(self, node: Node) -> None:

@@ -1,7 +1,8 @@
 """Writes the state of a running sweep to `state.json`, and stops the sweep on `stop.json`.
 
 `state.json` is written every few seconds. `status` and the live page read it, on any machine that
-reaches the storage. `stop.json` in the same folder stops the driver like Ctrl-C.
+reaches the storage. A new `stop.json` in the same folder stops every driver like Ctrl-C. Several
+drivers write the same `state.json` in turn.
 """
 
 from __future__ import annotations
@@ -63,6 +64,8 @@ class StateFile(Listener):
         }
         self._state: dict[str, Any] = {}
         self._next_update = 0.0
+        self._stop_before: Any = None
+        """An earlier request to stop."""
         self._written_trials = 0
         """Number of trials in the last `plan.json`."""
         self._ended = threading.Event()
@@ -70,7 +73,7 @@ class StateFile(Listener):
         self._interval = REMOTE_SECONDS if is_remote(sweep.storage) else LOCAL_SECONDS
 
     def __enter__(self) -> Self:
-        self._sweep.location.remove(sweep_files.STOP)
+        self._stop_before = self._sweep.location.read(sweep_files.STOP)
         for node in self._sweep.scheduler.having(Status.REUSED):
             self.reused(node)
         self._update()
@@ -105,6 +108,9 @@ class StateFile(Listener):
         self._in_workers.add(node.key)
 
     def paused(self, node: Node) -> None:
+        self._in_workers.discard(node.key)
+
+    def left(self, node: Node, holder: str) -> None:
         self._in_workers.discard(node.key)
 
     def reported(self, node: Node, reports: list[Report]) -> None:
@@ -243,13 +249,10 @@ class StateFile(Listener):
 
     def _stop_requested(self) -> bool:
         try:
-            if self._sweep.location.read(sweep_files.STOP) is None:
-                return False
+            request = self._sweep.location.read(sweep_files.STOP)
         except StorageError:
             return False
-        with contextlib.suppress(StorageError):  # the next driver deletes it
-            self._sweep.location.remove(sweep_files.STOP)
-        return True
+        return request is not None and request != self._stop_before
 
     def _write(self) -> None:
         state = self._state | {"driver": self._driver | {"heartbeat": time.time()}}

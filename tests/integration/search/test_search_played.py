@@ -35,6 +35,7 @@ from music_rllib.program import main
 from music_rllib.results.analysis import stage_scopes
 from music_rllib.results.conditions import find_stages
 from music_rllib.results.read import read_sweep
+from music_rllib.search import study as study_module
 from music_rllib.search.outcome import outcome
 from music_rllib.sweep.listeners.state_file import StateFile
 from tests.played_search import SPACE, Document, Driver, document, points, searched, success
@@ -112,7 +113,9 @@ def test_searches_that_share_runs_both_end(tmp_path: Path) -> None:
         assert {trial["state"] for trial in found["arms"][0]["trials"]} == {"judged", "pruned"}
 
 
-def test_a_trial_that_another_driver_has_ended_is_left_to_it(tmp_path: Path) -> None:
+def test_a_trial_that_another_driver_has_ended_is_left_to_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     shared = document({"storage": f"sqlite:///{tmp_path}/x.db", "study": "q"}, seeds=[0])
     one, other = (Driver(tmp_path, shared | {"name": name}) for name in ("a", "b"))
     mine, theirs = (driver.controller.searches[0].studies[0] for driver in (one, other))
@@ -125,7 +128,8 @@ def test_a_trial_that_another_driver_has_ended_is_left_to_it(tmp_path: Path) -> 
     second = theirs.claim()
     assert second is not None
     theirs.trials()
-    mine.release_the_dead(now=time.time() + 1000)
+    monkeypatch.setattr(study_module, "LEASE_SECONDS", 0.0)
+    mine.release_the_dead()
     taken = mine.claim()
     assert taken is not None
     assert taken.number == second.number
@@ -581,7 +585,32 @@ def test_two_drivers_share_a_study(tmp_path: Path) -> None:
     assert alone.trials() == one.trials()
 
 
-def test_a_dead_drivers_trials_are_taken_over(tmp_path: Path) -> None:
+@pytest.mark.parametrize("study", ["of the sweep", "of each driver"])
+def test_two_drivers_of_one_sweep_share_its_runs(
+    study: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Drivers on two machines with a bucket have a study each, with the same trials."""
+    search = {"trials": 5, "concurrent": 2, "final": {"trials": 1, "seeds": 2}}
+    alone = searched(tmp_path / "alone", search, seeds=[0, 1])
+    drivers = []
+    for seed in (0, 1):
+        if study == "of each driver":
+            (tmp_path / f"{seed}").mkdir()
+            monkeypatch.setenv(names.VARIABLE_STUDIES, str(tmp_path / f"{seed}"))
+        content = document(search, seeds=[0, 1])
+        drivers.append(Driver(tmp_path / "shared", content, seed=seed, leases=True))
+    play_in_turns(*drivers)
+    one, other = drivers
+    assert one.trials() == other.trials() == alone.trials()
+    assert sorted(one.computed + other.computed) == sorted(alone.computed), "each run once"
+    assert one.computed
+    assert other.computed
+    assert one.sweep.finished == other.sweep.finished == alone.sweep.finished
+
+
+def test_a_dead_drivers_trials_are_taken_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     search = {"storage": f"sqlite:///{tmp_path}/shared.db", "study": "together"}
     dead = Driver(tmp_path, document(search))
     dead.play(stop_after=4)
@@ -592,8 +621,13 @@ def test_a_dead_drivers_trials_are_taken_over(tmp_path: Path) -> None:
     mine = driver.controller.searches[0].studies[0]
     mine.release_the_dead()
     assert [t.number for t in mine.trials() if t.state.name == "RUNNING"] == held, "it is alive"
-    later = 10_000_000_000.0
-    mine.release_the_dead(later)
+    # A fast clock has dated its heartbeat ahead, and it is dead.
+    name, ahead = f"driver:{study._me}", time.time() + 3600
+    mine._storage.set_study_user_attr(mine._id, name, ahead)
+    mine.release_the_dead()
+    assert [t.number for t in mine.trials() if t.state.name == "RUNNING"] == held, "it may be alive"
+    monkeypatch.setattr(study_module, "LEASE_SECONDS", 0.0)
+    mine.release_the_dead()
     driver.play()
     assert [trial["state"] for trial in driver.trials()] == ["judged"] * 6
 
@@ -605,7 +639,9 @@ def test_a_driver_whose_trials_were_taken_over_changes_nothing(tmp_path: Path) -
     silent = Driver(tmp_path / "silent", document(search))
     silent.play(stop_after=5)
     other = Driver(tmp_path / "other", document(search))
-    other.controller.searches[0].studies[0].release_the_dead(10_000_000_000.0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(study_module, "LEASE_SECONDS", 0.0)
+        other.controller.searches[0].studies[0].release_the_dead()
     other.play()
     before = other.trials()
     silent.play()

@@ -113,10 +113,10 @@ def test_what_is_too_large_or_not_wanted_is_not_kept(tmp_path: Path) -> None:
     node = job(tmp_path, settings("tac", env_steps=200))
     for most in (0.0, 0.001):
         compute(node.model_copy(update={"checkpoints": Checkpoints(finished_mb=most)}))
-        assert not NodeStore(str(tmp_path)).has_continuations()
+        assert not NodeStore(str(tmp_path)).existing()["continuations"]
         NodeStore(str(tmp_path)).remove(node.key)
     compute(node)
-    assert NodeStore(str(tmp_path)).has_continuations()
+    assert NodeStore(str(tmp_path)).existing()["continuations"]
 
 
 LINEAR: dict[str, Any] = {"schedule": "linear", "start": 2.0, "end": 1.0}

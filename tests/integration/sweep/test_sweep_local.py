@@ -127,7 +127,7 @@ def test_tasks_without_success_show_their_return_from_the_first_line_to_the_repo
         assert words in said
 
 
-def test_beside_a_second_driver_stopped_killed_and_continued(
+def test_two_drivers_of_one_sweep_stopped_killed_and_continued(
     sweep_program: Any,
     sweep_document: Document,
     mlflow_runs: Runs,
@@ -145,39 +145,38 @@ def test_beside_a_second_driver_stopped_killed_and_continued(
         "evaluation": {"interval": 200, "episodes": 2},
     }
     sweep_document["stages"] = sweep_document["stages"][:1]
+    sweep_document |= {"seeds": [0, 1], "resources": {"num_cpus": 1}}
     sweep_program.write(sweep_document)
 
-    process = sweep_program.start_until(" 200 of 2,000 env steps")
-    places = listening(process)
+    one = sweep_program.start_until(" 200 of 2,000 env steps")
+    places = listening(one)
     assert "raylet" in set.union(*places.values())
     assert all(ip_address(place.removeprefix("::ffff:")).is_loopback for place in places), places
-    code, _, errors = call(main, tmp_path, "run", "sweep.yaml")
+    other = sweep_program.start_until("seed1: 200 of 2,000 env steps")
+    code, _, errors = call(main, tmp_path, "run", "sweep.yaml", "--retrain", "seed0")
     assert code == 2
-    assert "must be used by one process at a time" in errors
-    process.send_signal(signal.SIGINT)
-    output, errors = process.communicate(timeout=60)
-    assert (process.returncode, errors) == (130, "")
+    assert "given while no other process runs points, got sweep 'points' (process" in errors
+    one.send_signal(signal.SIGINT)
+    output, errors = one.communicate(timeout=60)
+    assert (one.returncode, errors) == (130, "")
     assert "continue with: python -m music_rllib.sweep run sweep.yaml" in output
-    assert [row[-1] for row in rows(output)] == ["interrupted"]
+    assert [row[-1] for row in rows(output)] == ["interrupted", "not started"]
+    other.kill()
+    other.communicate()
 
-    process = sweep_program.start_until(": continues at ")
-    for line in process.stdout:
-        if re.search(r" [68]00 of ", line):
-            break
-    process.kill()
-    process.communicate()
-
+    one = sweep_program.start_until("seed0: continues at ")
+    other = sweep_program.start_until("seed1: continues at ")
     fast.touch()
-    code, output, errors = sweep_program.run()
-    assert (code, errors) == (0, "")
-    (continued,) = re.findall(r"continues at ([\d,]+) env steps", output)
-    assert int(continued.replace(",", "")) >= 400
-    assert [row[-1] for row in rows(output)] == ["finished"]
+    for process in (one, other):
+        output, errors = process.communicate(timeout=240)
+        assert (process.returncode, errors) == (0, "")
+        assert [row[-1] for row in rows(output)] == ["finished", "finished"]
     evaluated = list(range(0, 2001, 200))
-    assert metric_steps(tmp_path, mlflow_runs()["seed 0 Point pretrain"]) == evaluated
+    for seed in (0, 1):
+        assert metric_steps(tmp_path, mlflow_runs()[f"seed {seed} Point pretrain"]) == evaluated
     assert list((tmp_path / "results" / "work").iterdir()) == []
-    (node,) = (tmp_path / "results" / "nodes").iterdir()
-    history = [json.loads(line) for line in (node / "history.jsonl").read_text().splitlines()]
-    assert [report["env_steps"] for report in history] == evaluated
-    seconds = [report["seconds"] for report in history]
-    assert seconds == sorted(seconds)
+    for node in (tmp_path / "results" / "nodes").iterdir():
+        history = [json.loads(line) for line in (node / "history.jsonl").read_text().splitlines()]
+        assert [report["env_steps"] for report in history] == evaluated
+        seconds = [report["seconds"] for report in history]
+        assert seconds == sorted(seconds)

@@ -35,7 +35,7 @@ from music_rllib.training import run as run_module
 from music_rllib.training import run_storage, sample_run
 from music_rllib.training.job import NodeJob
 from music_rllib.training.run import TrainingRun, _means, _training_metrics
-from music_rllib.training.worker import CAUSE, NOTES, REPORTS, RunTrainable
+from music_rllib.training.worker import CAUSE, LEFT, NOTES, REPORTS, RunTrainable
 
 pytestmark = pytest.mark.integration
 
@@ -319,13 +319,7 @@ def test_a_finished_node_is_not_trained_again(pretrained: NodeJob) -> None:
     manifest = Path(NodeStore(node.storage).path(node.key)) / "manifest.json"
     before = manifest.stat().st_mtime_ns
     (result,) = compute(node)
-    assert result["done"]
-    assert [report.env_steps for report in from_json_lines(result[REPORTS].encode())] == [
-        0,
-        200,
-        400,
-        600,
-    ]
+    assert (result["done"], LEFT in result) == (True, True)
     assert manifest.stat().st_mtime_ns == before
 
 

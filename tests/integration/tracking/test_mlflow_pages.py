@@ -24,7 +24,8 @@ from music_rllib.results.archive import read_archive
 from music_rllib.results.data import Sweep
 from music_rllib.store.history import Report
 from music_rllib.sweep.listeners.mlflow_view import VERSIONS, comparison_view
-from music_rllib.tracking.tracker import Tracker, finished_run
+from music_rllib.tracking.listener import finished_run
+from music_rllib.tracking.tracker import Tracker
 from tests.integration.conftest import REPOSITORY
 from tests.integration.devtools import Page
 from tests.integration.mlflow_server import MlflowServer, comparing

@@ -103,6 +103,7 @@ def test_checkpoints_and_ends_of_shorter_runs_are_checked(tmp_path: Path) -> Non
     assert "would continue a run of 400 env steps" in str(text_of(longer))
     with first.store.work_folder(longer.plan.nodes[0].key).new_checkpoint(200, OLD):
         pass
+    longer = opened(tmp_path, NEW, env_steps=800)
     assert "is at 200 env steps" in str(text_of(longer))
     assert text_of(opened(tmp_path, OLD, env_steps=800)) is None
     remove_runs(longer, to_retrain(longer, found_runs(longer), ["Lab"], all_changed=False), print)

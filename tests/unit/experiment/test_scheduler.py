@@ -6,12 +6,13 @@ from typing import Any
 
 import pytest
 import yaml
+from ray.tune.error import TuneError
 from ray.tune.search import Searcher
 
 from music_rllib.config.load import load_config
 from music_rllib.experiment.plan import Plan, make_plan
 from music_rllib.experiment.scheduler import Scheduler, Status
-from music_rllib.tune.runner import DagSearcher
+from music_rllib.tune.runner import DagSearcher, _file_error
 
 STAGES: list[dict[str, Any]] = [
     {"name": "a", "variant": "music-u"},
@@ -137,3 +138,20 @@ def test_every_node_starts_once_and_after_its_input(plan: Plan, seed: int) -> No
         if source is not None:
             assert scheduler[source.key] is Status.FINISHED
             assert handed_out.index(source.key) < handed_out.index(key)
+
+
+def test_an_error_of_the_storage_is_found_behind_one_of_tune() -> None:
+    """Tune raises the text of a traceback in place of an error in a callback."""
+
+    def behind(error: Exception) -> BaseException | None:
+        try:
+            try:
+                raise error
+            except Exception:
+                raise TuneError("Traceback (most recent call last): ...")  # noqa: B904
+        except TuneError as found:
+            return _file_error(found)
+
+    away = OSError("HTTP status 503")
+    assert behind(away) is away
+    assert behind(ValueError("a bug")) is None

@@ -15,7 +15,6 @@ from pathlib import Path
 import psutil
 import pyarrow.fs as pafs
 import pytest
-from fsspec.implementations.memory import MemoryFileSystem  # type: ignore[import-untyped]
 
 from music_rllib.store import lease as lease_module
 from music_rllib.store.lease import HeldLease, Lease, LeaseFile, LeaseLostError, runs_here
@@ -35,10 +34,9 @@ def place(
     if request.param == "disk":
         return lease_file(tmp_path / "work" / "lease.json")
     monkeypatch.setattr(lease_module, "SETTLE_SECONDS", 0.05)
-    memory = MemoryFileSystem()
-    memory.store.clear()
-    memory.pseudo_dirs[:] = [""]
-    filesystem = pafs.PyFileSystem(pafs.FSSpecHandler(memory))
+    # Not a file system in memory: its readers share one position in a file.
+    (tmp_path / "bucket" / "work").mkdir(parents=True)
+    filesystem = pafs.SubTreeFileSystem(str(tmp_path), pafs.LocalFileSystem())
     return LeaseFile(StorageFolder(filesystem, "bucket/work"), "lease.json")
 
 
@@ -177,6 +175,26 @@ def test_a_lease_dated_in_the_future_is_valid_while_renewed(
     assert place.acquire(mine) == later, "it was renewed"
     passed[0] = 140.0
     assert place.acquire(mine) is None
+
+
+def test_a_look_at_a_lease_from_a_fast_clock_takes_a_minute_at_most(
+    place: LeaseFile, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lease_module, "EXPIRES_SECONDS", 0.6)
+    monkeypatch.setattr(lease_module, "LOOK_SECONDS", 0.1)
+    theirs = elsewhere(seconds=3600.0)
+    assert place.acquire(theirs) is None
+    assert place.holder() == theirs
+    assert place.holder(watch=True) is None, "it is not renewed"
+    place.remove_invalid()
+    assert place.read() is None, "others need not wait"
+    assert place.acquire(theirs) is None
+    renewing = threading.Timer(
+        0.2, place.renew, [theirs.model_copy(update={"expires": theirs.expires + 1})]
+    )
+    renewing.start()
+    assert place.holder(watch=True) is not None, "it is renewed"
+    renewing.join()
 
 
 def test_an_owner_that_lost_its_lease_leaves_no_folder(tmp_path: Path) -> None:

@@ -174,9 +174,9 @@ def test_verified_files_are_read_once_and_later_damage_is_found(
     read: list[str] = []
     check = SealedFolders.check
 
-    def counting(folders: SealedFolders, name: str) -> Manifest:
+    def counting(folders: SealedFolders, name: str, *sizes: None) -> Manifest:
         read.append(name)
-        return check(folders, name)
+        return check(folders, name, *sizes)
 
     monkeypatch.setattr(SealedFolders, "check", counting)
     # A file's ctime cannot be set to an older time, so new files must count as old here.

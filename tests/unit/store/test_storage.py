@@ -5,15 +5,22 @@ from __future__ import annotations
 import os
 import socket
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import pyarrow.fs as pafs
 import pytest
+from fsspec.implementations.memory import MemoryFileSystem  # type: ignore[import-untyped]
 
 from music_rllib.config.load import load_config
 from music_rllib.config.problems import ConfigError
 from music_rllib.store import storage as storage_module
+from music_rllib.store.patience import be_patient
+from music_rllib.store.sealed import SealedFolders
 from music_rllib.store.storage import (
     StorageError,
+    StorageFolder,
     below,
     check_answers,
     check_storage,
@@ -114,3 +121,80 @@ def test_a_sweep_uri_keeps_the_options_of_its_storage(storage: str) -> None:
     uri = below(storage, "mine")
     assert storage_and_name(uri) == (storage, "mine")
     assert uri.partition("?")[0].endswith("/mine")
+
+
+class Away(pafs.FSSpecHandler):  # type: ignore[misc]
+    """A bucket of which every second request fails with `error`, as pyarrow words it."""
+
+    error = "When reading, got AWS Error INTERNAL_FAILURE (HTTP status 500)"
+    requests = 0
+
+    def _fail(self) -> None:
+        type(self).requests += 1
+        if self.requests % 2:
+            raise OSError(self.error)
+
+    def get_file_info(self, paths: Any) -> Any:
+        self._fail()
+        return super().get_file_info(paths)
+
+    def get_file_info_selector(self, selector: Any) -> Any:
+        self._fail()
+        return super().get_file_info_selector(selector)
+
+    def open_input_stream(self, path: str) -> Any:
+        self._fail()
+        return super().open_input_stream(path)
+
+    def open_output_stream(self, path: str, metadata: Any) -> Any:
+        self._fail()
+        return super().open_output_stream(path, metadata)
+
+    def delete_dir(self, path: str) -> None:
+        self._fail()
+        super().delete_dir(path)
+
+
+@pytest.fixture
+def away(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[StorageFolder, list[str]]]:
+    """The bucket, for which this process waits for a minute, and what it says."""
+    memory = MemoryFileSystem()
+    memory.store.clear()
+    memory.pseudo_dirs[:] = [""]
+    said: list[str] = []
+    clock = iter(range(0, 10_000, 7))
+    monkeypatch.setattr(time, "sleep", lambda _: None)
+    monkeypatch.setattr(time, "monotonic", lambda: float(next(clock)))
+    be_patient(1.0, said.append)
+    yield StorageFolder(pafs.PyFileSystem(Away(memory)), "bucket/work"), said
+    be_patient(0.0)
+
+
+def test_a_bucket_that_answers_500_is_asked_again(
+    away: tuple[StorageFolder, list[str]], tmp_path: Path
+) -> None:
+    bucket, said = away
+    nodes = SealedFolders(bucket)
+    with nodes.sealing("node", {"a": 1}) as folder:
+        (folder / "weights").write_bytes(b"x" * 3_000_000)
+    assert nodes.check("node").meta == {"a": 1}
+    nodes.fetch("node", tmp_path)
+    assert (tmp_path / "weights").stat().st_size == 3_000_000
+    nodes.remove("node")
+    assert not nodes.exists("node")
+    assert said[0].startswith("the storage does not answer, trying again for 1 min: When reading")
+    assert said[1] == "the storage answers again"
+
+
+def test_a_bucket_that_refuses_is_not_asked_again(
+    away: tuple[StorageFolder, list[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bucket, said = away
+    monkeypatch.setattr(Away, "requests", 0)
+    monkeypatch.setattr(Away, "error", "AWS Error ACCESS_DENIED")
+    with pytest.raises(OSError, match="ACCESS_DENIED"):
+        bucket.read("x")
+    monkeypatch.setattr(Away, "_fail", lambda _: (_ for _ in ()).throw(OSError("HTTP status 503")))
+    with pytest.raises(OSError, match="503"):
+        bucket.read("x")
+    assert len(said) == 1, "it waits for a minute"

@@ -44,7 +44,7 @@ def program(
     """`music-rllib` in a folder of its own, up to where a sweep would begin."""
     monkeypatch.chdir(tmp_path)
 
-    def begun(*_: object) -> int:
+    def begun(*_: object, **__: object) -> int:
         raise AssertionError("the sweep began")
 
     monkeypatch.setattr(execution, "compute_and_report", begun)
@@ -221,7 +221,7 @@ def test_a_plan_is_refused_as_its_sweep_would_be(
 def test_a_refused_configuration_does_not_replace_the_one_that_ran(
     program: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(execution, "compute_and_report", lambda *_: 0)
+    monkeypatch.setattr(execution, "compute_and_report", lambda *_, **__: 0)
     assert program(document()).exit_code == 0
     before = (tmp_path / "results/s/config.json").read_text()
     other = document(seeds=[7], mlflow={"tracking_uri": "http://127.0.0.1:9"})
@@ -335,7 +335,7 @@ def test_a_mistyped_option_is_bad_input(program: Program) -> None:
 def test_values_of_the_command_line_are_recorded(
     program: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(execution, "compute_and_report", lambda *_: 0)
+    monkeypatch.setattr(execution, "compute_and_report", lambda *_, **__: 0)
     assert program(document(), "seeds=2", "env_steps=7e3").exit_code == 0
     kept = json.loads((tmp_path / "results/s/config.json").read_text())
     assert (kept["seeds"], kept["defaults"]["env_steps"]) == ([0, 1], 7000)

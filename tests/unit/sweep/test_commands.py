@@ -21,9 +21,10 @@ from music_rllib.config.load import load_config
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.experiment import open_sweep as open_sweep_module
 from music_rllib.experiment import sweep_files
+from music_rllib.experiment.environments import changed_text, found_runs
 from music_rllib.experiment.open_sweep import OpenSweep, open_sweep, remove_damaged
 from music_rllib.experiment.plan import Node, continuation_key, make_plan
-from music_rllib.experiment.record import keep_record
+from music_rllib.experiment.record import changes_since, continued_runs_text, keep_record
 from music_rllib.experiment.scheduler import Status
 from music_rllib.experiment.sweep_files import as_json
 from music_rllib.names import ShortLabels
@@ -33,10 +34,12 @@ from music_rllib.results.answer import answer, claim_rows, mean_rows
 from music_rllib.results.read import read_sweep
 from music_rllib.results.study import study_of
 from music_rllib.results.tables import performance_tables
+from music_rllib.store import lease as lease_module
 from music_rllib.store import node_store
 from music_rllib.store import storage as storage_module
 from music_rllib.store.handoff import write_handoff
 from music_rllib.store.history import HISTORY, Report, RunResult, to_json_lines
+from music_rllib.store.lease import Lease
 from music_rllib.store.storage import DamagedError, StorageFolder
 from music_rllib.sweep import clean, driver, driver_lock, execution
 from music_rllib.sweep.export import sweep_of_run
@@ -407,12 +410,80 @@ def test_clean_is_refused_while_a_sweep_is_being_started(
 ) -> None:
     """Its state is still that of its last driver."""
     sweep = played(storage, tmp_path)
-    with driver_lock.hold_driver_lock(sweep):
+    with driver_lock.driving(sweep.storage, "mine"):
         said = program("clean", f"{storage}/mine", "--all", "--yes")
         assert (said.code, "mine is: stop it first" in said.errors) == (2, True)
         assert program("stop", f"{storage}/mine", "--wait", "0").code == 0
     assert len(sweep.finished) == 9
     assert program("clean", f"{storage}/mine", "--all", "--yes").code == 0
+
+
+@IN_A_BUCKET
+def test_clean_deletes_nothing_if_another_process_computes_a_run(
+    storage: str, tmp_path: Path, program: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A worker that outlives its driver, or one of another sweep."""
+    monkeypatch.setattr(lease_module, "SETTLE_SECONDS", 0.0)
+    sweep = played(storage, tmp_path, runs=7)
+    first, second = (sweep.store.work_folder(node.key) for node in sweep.plan.nodes[7:9])
+    for work in (first, second):
+        with work.new_checkpoint(400) as new:
+            (new.folder / "x").touch()
+    theirs = Lease.of_this_process("sweep 'other'")
+    assert second.lease.acquire(theirs) is None
+    said = program("clean", f"{storage}/mine", "--all", "--yes")
+    assert (said.code, "got sweep 'other' (process" in said.errors) == (2, True)
+    assert len(sweep.store.finished(node.key for node in sweep.plan.nodes)) == 7
+    assert [len(work.names()) for work in (first, second)] == [1, 1]
+    assert first.lease.read() is None
+    second.lease.release(theirs.owner)
+    assert program("clean", f"{storage}/mine", "--all", "--yes").code == 0
+    assert not sweep.store.begun()
+
+
+@pytest.mark.parametrize("storage", ["bucket"], indirect=True)
+def test_a_plan_of_ten_thousand_runs_asks_a_bucket_for_less_than_a_minute(
+    storage: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each request takes 25 ms, of which `REQUESTS` run at once in threads of the pool."""
+    seconds = 0.0
+    # pyarrow reads the size of an object before its content, and a missing object may be a folder.
+    costs = {"get_file_info": 2, "get_file_info_selector": 1, "open_input_stream": 2}
+
+    def counted(name: str) -> Callable[..., Any]:
+        method = getattr(pafs.FSSpecHandler, name)
+
+        def call(*arguments: Any) -> Any:
+            nonlocal seconds
+            alone = threading.current_thread() is threading.main_thread()
+            seconds += 0.025 * costs[name] / (1 if alone else storage_module.REQUESTS)
+            return method(*arguments)
+
+        return call
+
+    def start(seeds: int) -> float:
+        """The time for requests of a sweep of which half of the runs are finished."""
+        nonlocal seconds
+        MemoryFileSystem.store.clear()
+        sweep = played(storage, tmp_path, runs=3 * seeds // 2, seeds=seeds)
+        node = sweep.plan.nodes[0]
+        last = sweep.store.continuation(continuation_key(node.run, node.source_key))
+        with last.new_checkpoint(4000) as new:
+            (new.folder / "x").touch()
+        seconds = 0.0
+        sweep = opened(storage, tmp_path, seeds=list(range(seeds)))
+        assert changes_since(sweep) is None
+        assert not changed_text(sweep, found_runs(sweep))
+        assert continued_runs_text(sweep) == []
+        with StateFile(sweep) as state_file:
+            assert len(sweep.results()) == 3 * seeds // 2
+            state_file.end("finished")
+        return seconds
+
+    for name in costs:
+        monkeypatch.setattr(pafs.FSSpecHandler, name, counted(name))
+    few, many = start(45), start(60)
+    assert few + (many - few) * (10_000 - 135) / 45 < 60
 
 
 @IN_A_BUCKET
