@@ -115,15 +115,21 @@ class Hanging(Point):
 
 
 class Paced(Point):
-    """Step slowly until the file `fast` exists, so that a run can be interrupted."""
+    """Step slowly until the file `fast` exists, so that a run can be interrupted.
 
-    def __init__(self, fast: str) -> None:
+    Args:
+        fast: path of the file.
+        after: number of steps before the slow ones.
+        seconds: duration of a slow step.
+    """
+
+    def __init__(self, fast: str, after: int = 0, seconds: float = 0.01) -> None:
         super().__init__()
-        self._fast = Path(fast)
+        self._fast, self._after, self._seconds = Path(fast), after, seconds
 
     def step(self, action: Array) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:
-        if not self._fast.exists():
-            time.sleep(0.01)
+        if self._steps >= self._after and not self._fast.exists():
+            time.sleep(self._seconds)
         return super().step(action)
 
 

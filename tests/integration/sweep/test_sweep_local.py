@@ -138,7 +138,8 @@ def test_two_drivers_of_one_sweep_stopped_killed_and_continued(
     fast = tmp_path / "fast"
     sweep_document["environments"]["Point"] |= {
         "env_id": "point_env:Paced-v0",
-        "env_kwargs": {"fast": str(fast)},
+        # It does not end before the other driver has begun.
+        "env_kwargs": {"fast": str(fast), "after": 140, "seconds": 0.2},
     }
     sweep_document["defaults"] |= {
         "env_steps": 2000,
