@@ -182,9 +182,9 @@ def compare(
         str | None,
         typer.Option(
             metavar="METRIC",
-            help="Metric to compare, by its last value in each run. Default: the objective of a "
-            "search, otherwise the primary metric of each task (success rate, or return without "
-            "success).",
+            help="Metric to compare, by its area under the curve and its final values. Default: "
+            "the primary metric of each task (success rate, or return without success); a search "
+            "shows final values of its objective.",
         ),
     ] = None,
     minimize: Annotated[
