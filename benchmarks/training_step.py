@@ -37,6 +37,18 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "TAC, HER, 3 x 128, frozen estimator": SMALL | {"estimator": "frozen"},
     "TAC, HER, 3 x 128, trained estimator": SMALL | {"estimator": "trained"},
 }
+AVERAGED: dict[str, Any] = SMALL | {"bootstrap": "critics", "policy_critic": "mean"}
+DROPPED = {"critics": 5, "quantiles": 25, "dropped_quantiles": 2}
+CRITICS: dict[str, dict[str, Any]] = {
+    "layer norm in the critics": SMALL | {"layer_norm": "critics"},
+    "layer norm everywhere": SMALL | {"layer_norm": "all"},
+    "REDQ's 10 critics": AVERAGED | {"critics": 10, "target_critics": 2},
+    "TQC's 5 critics": AVERAGED | DROPPED,
+    "REDQ's 10 critics, policy delayed by 20": AVERAGED
+    | {"critics": 10, "target_critics": 2, "policy_delay": 20},
+}
+"""Variants of 3 x 128 with other critics, held against their own products."""
+VARIANTS |= {f"TAC, HER, 3 x 128, {name}": settings for name, settings in CRITICS.items()}
 PEERS: dict[str, tuple[str, float | None]] = {
     "TAC": ("raw torch", 1.0),
     "TAC, HER": ("raw torch", 1.0),
@@ -142,10 +154,15 @@ def _products(product: Callable[..., Any], rows: int, width: int, whole: int) ->
     return turn
 
 
-def flops(inputs: int, actions: int, hidden: Sequence[int], batch: int) -> int:
+def flops(
+    inputs: int, actions: int, hidden: Sequence[int], batch: int, *, bootstrap: str = "value",
+    critics: int = 2, target_critics: int | None = None, quantiles: int = 0,
+    policy_critic: str = "min", policy_delay: int = 1,
+) -> float:  # fmt: skip
     """Multiplications and additions of all matrix products that one update needs.
 
-    An action of the policy has a gradient through its smaller critic only.
+    An action of the policy has a gradient through its smallest critic only, unless their mean is
+    used.
     """
 
     def layers(first: int, last: int) -> list[int]:
@@ -157,11 +174,18 @@ def flops(inputs: int, actions: int, hidden: Sequence[int], batch: int) -> int:
                    for p in passes.split())  # fmt: skip
 
     trained = "forward weights hidden"
-    policy = cost(layers(inputs, 2 * actions), trained)
-    value = cost(layers(inputs, 1), trained) + cost(layers(inputs, 1), "forward")
-    critic = layers(inputs + actions, 1)
-    critics = 2 * cost(critic, trained) + 2 * cost(critic, "forward") + cost(critic, "inputs")
-    return 2 * batch * (policy + value + critics)
+    of_policy, of_value = layers(inputs, 2 * actions), layers(inputs, 1)
+    critic = layers(inputs + actions, quantiles or 1)
+    policy = cost(of_policy, "forward") + cost(of_policy, "weights hidden") / policy_delay
+    asked = critics * cost(critic, "forward")
+    improved = (critics if policy_critic == "mean" else 1) * cost(critic, "inputs") / policy_delay
+    if bootstrap == "value":
+        following = cost(of_value, trained) + cost(of_value, "forward")
+    else:
+        following = (target_critics or critics) * cost(critic, "forward")
+        following += cost(of_policy, "forward")
+        asked /= policy_delay
+    return 2 * batch * (policy + following + critics * cost(critic, trained) + asked + improved)
 
 
 def rows(repeats: int) -> Iterator[Row]:
@@ -170,6 +194,8 @@ def rows(repeats: int) -> Iterator[Row]:
         taken = interleaved(_turns(), ROUNDS * repeats)
     for name in SIZES:
         yield from _against_the_best(name, taken)
+    for name, settings in CRITICS.items():
+        yield _against_own_products(f"TAC, HER, 3 x 128, {name}", settings, taken)
     for name, (peer, limit) in PEERS.items():
         yield _row(name, taken, peer, f"{peer} (time)", at_most=limit)
 
@@ -188,10 +214,30 @@ def _against_the_best(name: str, taken: dict[str, list[Taken]]) -> Iterator[Row]
     width = SIZES[name]
     if f"JAX {width}" in taken:
         yield _row(name, taken, f"JAX {width}", "a JAX jit of the update alone (time)", at_most=1.1)
-    floors_of_it = [one for one in taken if one.endswith(f"{width} x {width}")]
-    floor = min(floors_of_it, key=lambda one: middle(taken[one]).cpu)
+    floor = _floor(width, taken)
     limit = OF_PRODUCTS[width]
     yield _row(name, taken, floor, f"its products at their best, {floor} (time)", at_most=limit)
+
+
+def _against_own_products(
+    name: str, settings: dict[str, Any], taken: dict[str, list[Taken]]
+) -> Row:
+    """Against as many products at the best rate as its networks need."""
+    sizes = (INPUTS, ACTIONS, (128,) * 3, BATCH)
+    of_networks = {k: v for k, v in settings.items() if k in flops.__kwdefaults__}
+    share = flops(*sizes, **of_networks) / flops(*sizes)
+    floor = _floor(128, taken)
+    products = [Taken(turn.wall * share, turn.cpu * share) for turn in taken[floor]]
+    return _row(
+        name, taken | {"products": products}, "products", f"its own products, {floor} (time)",
+        at_most=OF_PRODUCTS[128],
+    )  # fmt: skip
+
+
+def _floor(width: int, taken: dict[str, list[Taken]]) -> str:
+    """The fastest products of a width."""
+    floors_of_it = [one for one in taken if one.endswith(f"{width} x {width}")]
+    return min(floors_of_it, key=lambda one: middle(taken[one]).cpu)
 
 
 def _row(
