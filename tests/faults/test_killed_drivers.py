@@ -188,4 +188,5 @@ def test_an_array_of_tasks_is_stopped_killed_and_requeued(
         for one in tasks.values():
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(one.pid, signal.SIGKILL)
+    assert sweeps.finish(program).count(": finished earlier, reused") == 3, "MLflow has all runs"
     comparison.same(unbroken, program.folder / "results")
