@@ -437,6 +437,19 @@ BAD: list[tuple[Document, str]] = [
         "replay.priority must be uniform with music.prioritise_replay, got td_error",
     ),
     (with_stage(1, music={"hidden_size": 64}), "needs the same music.hidden_size in stage finetu"),
+    (with_stage(1, music={"bound": "nwj"}), "needs the same music.bound in stage finetune as in"),
+    (with_stage(0, intrinsic={"reward": "rdn"}), "intrinsic.reward must be displacement, random"),
+    (with_stage(0, intrinsic={"reward": "a b:C"}), "or module:Class of your own, got 'a b:C'"),
+    (with_stage(0, intrinsic={"weight": -1.0}), "intrinsic.weight must be >= 0, got -1"),
+    (with_stage(0, intrinsic={"frozen": True}), "intrinsic.frozen must be false for music-u, got"),
+    (
+        with_stage(1, variant="intrinsic-u", init_from=None),
+        "intrinsic.reward must be given for intrinsic-u",
+    ),
+    (
+        with_stage(1, variant="intrinsic-r", intrinsic={"reward": "rnd"}),
+        "must be a stage with intrinsic.reward, got 'pretrain', which has none",
+    ),
     (with_stage(1, name="pretrain"), "stages.pretrain.name must not repeat"),
     (with_stage(1, grid={"seed": [1]}), "grid.seed is not a known setting (did you mean 'seeds'?)"),
     (with_stage(1, grid={"tac.entropic_index": []}), "must have at least 1 entries, got []"),
@@ -558,6 +571,26 @@ def test_an_estimator_must_come_from_a_stage_that_has_one(
     document = with_stage(0, variant="tac", name="pretrain")
     (line,) = problems(document)
     assert "must be a stage with an estimator, got 'pretrain', which is tac" in line
+
+
+def test_an_intrinsic_reward_is_pretrained_frozen_and_handed_over(
+    load: Callable[..., SweepConfig], problems: Callable[[Document], list[str]]
+) -> None:
+    stages: list[Document] = [
+        {"name": "u", "variant": "intrinsic-u"},
+        {"name": "r", "variant": "intrinsic-r", "init_from": "u", "intrinsic": {"weight": 0.3}},
+    ]
+    defaults = {"intrinsic": {"reward": "rnd", "settings": {"hidden": 8}}}
+    config = load(changed(stages=stages, defaults=defaults))
+    first, second = (run_of(config, i) for i in range(2))
+    assert (first.music.task_reward, first.intrinsic.weight, first.intrinsic.frozen) == (0, 1, 0)
+    assert (second.music.task_reward, second.intrinsic.weight, second.intrinsic.frozen) == (
+        1, 0.3, 1,
+    )  # fmt: skip
+    assert (handed_over(first), handed_over(second)) == ((), ("intrinsic",))
+    stages[1]["intrinsic"]["settings"] = {"hidden": 9}
+    (line,) = problems(changed(stages=stages, defaults=defaults))
+    assert "needs the same intrinsic.reward and intrinsic.settings in stage r as in stage u" in line
 
 
 def checkpoint(folder: Path, task: str = "FetchPush", **changes: Any) -> str:

@@ -9,6 +9,7 @@ from pathlib import Path
 import gymnasium as gym
 import pytest
 
+from music_rllib.config.run_settings import RunSettings
 from music_rllib.envs import fingerprint as module
 from music_rllib.envs.fingerprint import (
     Fingerprint,
@@ -18,7 +19,8 @@ from music_rllib.envs.fingerprint import (
     on_another_machine,
 )
 from music_rllib.envs.make import make_env
-from music_rllib.envs.tasks import search_in
+from music_rllib.envs.tasks import BUILT_IN_TASKS, search_in
+from music_rllib.intrinsic.settings import IntrinsicSettings
 
 FILES = {
     "lab/__init__.py": "",
@@ -65,6 +67,23 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 def now(folder: Path) -> Fingerprint:
     return fingerprint_of("lab.envs:Lab-v0", {"scene": str(folder / "scene.txt"), "size": 2})
+
+
+def test_an_own_reward_is_part_of_the_environment_of_its_runs_only(folder: Path) -> None:
+    (folder / "lab_late.py").write_text("import lab_dynamic\n")
+    task = BUILT_IN_TASKS["FetchPush"]
+    plain = RunSettings(task=task, variant="tac", seed=0)
+    own = plain.model_copy(update={"intrinsic": IntrinsicSettings(reward="lab_late:Mine")})
+
+    def of(run: RunSettings) -> Fingerprint:
+        return fingerprint_of(task.env_id, task.env_kwargs, run.own_modules)
+
+    before = of(own)
+    new = {name for name in before.keys() - of(plain).keys() if name.startswith("source")}
+    assert new == {"source lab_late.py", "source lab_dynamic.py"}
+    assert (plain.code, own.code) == ("FetchPush", "FetchPush with lab_late")
+    (folder / "lab_dynamic.py").write_text("x = 1\n")
+    assert differences(before, of(own)) == ["lab_dynamic.py changed"]
 
 
 def test_sources_models_and_packages_are_found(folder: Path) -> None:

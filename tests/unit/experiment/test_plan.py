@@ -146,6 +146,7 @@ def settings(**changes: Any) -> RunSettings:
         {"tac": {"lr": 0.0011}},
         {"tac": {"log_std_form": "tanh"}},
         {"replay": {"hindsight_k": 1.0}},
+        {"intrinsic": {"reward": "rnd"}},
         {"music": variant_music("music-u", BUILT_IN_TASKS["FetchPush"]) | {"lr": 0.0011}},
         {"task": BUILT_IN_TASKS["FetchPush"].model_copy(update={"horizon": 49})},
         {"task": BUILT_IN_TASKS["FetchPickAndPlace"]},
@@ -161,6 +162,15 @@ def test_moved_distance_is_part_of_the_key_only_if_used() -> None:
     assert node_key(settings(task=task), None) == node_key(settings(), None)
     moved = {"replay": {"hindsight_episodes": "moved"}}
     assert node_key(settings(task=task, **moved), None) != node_key(settings(**moved), None)
+
+
+def test_settings_of_no_intrinsic_reward_are_not_part_of_the_key() -> None:
+    assert node_key(settings(intrinsic={"weight": 0.7}), None) == node_key(settings(), None)
+    keys = {
+        node_key(settings(intrinsic={"reward": "rnd", **changes}), None)
+        for changes in ({}, {"weight": 0.7}, {"lr": 0.01}, {"settings": {"hidden": 8}})
+    }
+    assert len(keys) == 4
 
 
 def test_source_and_algorithm_version_are_part_of_the_key(
