@@ -302,9 +302,9 @@ class RunSettings(StrictModel):
             if getattr(self.music, field) != value:
                 rule = contradiction(self.variant, value, getattr(self.music, field))
                 raise ValueError(f"music.{field} {rule}")
-        self.music.check_has_reward(self.intrinsic)
         if self.variant.startswith("intrinsic-") and self.intrinsic.reward is None:
             raise ValueError(f"intrinsic.reward must be given for {self.variant}, got null")
+        self.music.check_has_reward(self.intrinsic)
         if self.intrinsic.frozen != (frozen := variant_intrinsic(self.variant)["frozen"]):
             rule = contradiction(self.variant, frozen, self.intrinsic.frozen)
             raise ValueError(f"intrinsic.frozen {rule}")
