@@ -83,7 +83,7 @@ class IntrinsicReward(nn.Module):
         raise NotImplementedError
 
     def loss(self, batch: Batch) -> Tensor | None:
-        """[] loss of the parameters, for a step of Adam at every second update; None: no step."""
+        """[] loss of the parameters, for a step of Adam at every fourth update; None: no step."""
         return None
 
     @torch.no_grad()

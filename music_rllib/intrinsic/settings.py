@@ -45,7 +45,7 @@ class IntrinsicSettings(StrictModel):
     """Weight of the reward, which lies in [-1, 0]. A schedule that ends at 0 leaves the optimum of
     the task unchanged at the end. 1 for intrinsic-u."""
     lr: float = Field(1e-3, gt=0)
-    """Adam's step size for its networks, which take a step at every second update."""
+    """Adam's step size for its networks, which take a step at every fourth update."""
     settings: dict[str, JsonValue] = Field(default_factory=dict)
     """Keyword arguments of its class, such as `{hidden: 128}`."""
     frozen: bool = False

@@ -98,7 +98,9 @@ def fingerprints(plan: Plan) -> dict[str, Fingerprint]:
         try:
             found[code] = fingerprint_of(run.task.env_id, run.task.env_kwargs, run.own_modules)
         except Exception as error:  # a user's module may raise anything
-            raise TaskError(f"environments.{code} must be importable: {error}") from error
+            own = f" and intrinsic.reward {run.intrinsic.reward}" if run.own_modules else ""
+            place = f"environments.{run.task.name}{own}"
+            raise TaskError(f"{place} must be importable: {error}") from error
     return found
 
 
