@@ -214,10 +214,8 @@ def study_tables(study: Study) -> list[Table]:
             )
             for claim in claims
         ],
-        note=f"Differences in {measures}. Seeds are compared in pairs (Student's t-test) if both "
-        "conditions have the same seeds, otherwise with Welch's t-test. Equivalence is tested with "
-        "two one-sided tests (TOST). p-values are adjusted (Holm) for the planned comparisons, or "
-        "for all comparisons if there is no plan. A failed run counts with the worst value.",
+        note=f"Differences in {measures}. p-values are adjusted (Holm) for the planned comparisons, "
+        "or for all comparisons if there is no plan. A failed run counts with the worst value.",
     )
     means = Table(
         name="area_under_curve",
@@ -235,8 +233,7 @@ def study_tables(study: Study) -> list[Table]:
             )
             for mean in study.means
         ],
-        note="The area under the learning curve is the mean over the budget (trapezoidal rule). A "
-        "failed run counts with the worst value.",
+        note="The area under the learning curve is the mean over the budget (trapezoidal rule).",
     )
     return [comparisons, means]
 
@@ -302,9 +299,8 @@ def performance_tables(analyses: Sequence[StageAnalysis]) -> list[Table]:
                 for analysis, scope in scopes
                 for first, second in scope.pairs
             ],
-            note="Difference of the means, without a test. "
-            "Probability of improvement: a run of the first condition ends higher than a run of "
-            "the second (ties count half).",
+            note="Differences of the means, without a test. Probability of improvement: a run of "
+            "the first condition ends higher than a run of the second (ties count half).",
         ),
     ]
 
