@@ -214,7 +214,7 @@ def study_tables(study: Study) -> list[Table]:
             )
             for claim in claims
         ],
-        note=f"Differences in {measures}. p-values are adjusted (Holm) for the planned comparisons, "
+        note=f"Differences in {measures}. p-values are adjusted (Holm) for planned comparisons, "
         "or for all comparisons if there is no plan. A failed run counts with the worst value.",
     )
     means = Table(
