@@ -19,8 +19,10 @@ import requests
 from sqlalchemy import create_engine, inspect, text
 
 from music_rllib import names
+from music_rllib.experiment.run_info import RunInfo
 from music_rllib.store.storage import database_url
 from music_rllib.tracking.store import resolve_store
+from music_rllib.tracking.tracker import Tracker
 from tests.faults import comparison
 from tests.integration.mlflow_server import USER, server_script
 from tests.ports import free_port
@@ -295,3 +297,7 @@ def _check_mlflow(postgresql: str, folder: Path) -> None:
         requests.post(url, json={"name": "shared"}, auth=user, timeout=60).raise_for_status()
     store = resolve_store(databases[0], str(folder))
     assert MlflowClient(store.uri).get_experiment_by_name("shared") is not None
+    fields: dict[str, Any] = {"storage": str(folder), "config": {}, "tracking_uri": databases[0]}
+    with Tracker(sweep_name="direct", **fields) as tracker:
+        tracker.start(RunInfo(node_key="a", name="a", config={"seed": 0}))
+    assert not tracker.pending()
