@@ -295,11 +295,15 @@ class Experiment:
         """Set tags; existing tags of the same names are overwritten."""
         self.log(run_id, tags=tags)
 
-    def log_policy(self, run_id: str, content: bytes) -> None:
-        """Upload a policy as the run's logged model, unless it was uploaded before."""
-        model = self._policy_model(run_id)
-        if model.status == LoggedModelStatus.READY:
+    def log_policy(self, run_id: str, content: bytes, tags: Mapping[str, str]) -> None:
+        """Upload a policy as the logged model of a run with these tags, unless it was before."""
+        model, outputs = self._earlier_model(run_id), None
+        if model is None:
+            model = self._new_model(run_id, tags)
+        elif model.status == LoggedModelStatus.READY:
             return
+        else:
+            outputs = self.client.get_run(run_id).outputs
         with TemporaryDirectory() as temporary:
             file, folder = Path(temporary, "policy.safetensors"), Path(temporary, "model")
             file.write_bytes(content)
@@ -308,19 +312,18 @@ class Experiment:
         # MLflow would cache an upload client, with its threads, for each of 1,024 models.
         getattr(utils, "_artifact_repos_cache", {}).pop(model.model_id, None)
         steps = int(policy.about.get("env_steps", 0))
-        outputs = self.client.get_run(run_id).outputs
         if not outputs or model.model_id not in [o.model_id for o in outputs.model_outputs]:
             self.client.log_outputs(run_id, [LoggedModelOutput(model.model_id, steps)])
         self.client.finalize_logged_model(model.model_id, LoggedModelStatus.READY)
 
-    def _policy_model(self, run_id: str) -> LoggedModel:
-        """The run's logged model; created unless an earlier attempt has created it."""
+    def _earlier_model(self, run_id: str) -> LoggedModel | None:
+        """The run's logged model, if an earlier attempt has created it."""
         found = self.client.search_logged_models(
             [self.id], f"tags.`{names.TAG_SOURCE_RUN}` = '{run_id}'", max_results=1
         )
-        if found:
-            return found[0]
-        tags = self.client.get_run(run_id).data.tags
+        return found[0] if found else None
+
+    def _new_model(self, run_id: str, tags: Mapping[str, str]) -> LoggedModel:
         shown = {key: tags[key] for key in names.TAGS_OF_A_MODEL if key in tags}
         return self.client.create_logged_model(
             self.id,

@@ -65,8 +65,8 @@ class RunQueue:
         """Last step that MLflow has of each metric."""
         self._ended = True
         self._cancelled = False
-        self._is_new = False
-        """Whether this process created the run, which has no params yet."""
+        self._is_new = self._has_begun = False
+        """Whether this process created the run, which has no params yet; or has begun it."""
         self._policy: Record = self._send_policy
         self._read_policy: Callable[[], bytes | None] | None = None
 
@@ -190,21 +190,27 @@ class RunQueue:
                     self._records.popleft()
 
     def _send_start(self) -> None:
-        self._experiment.log(self.attach().run_id, params=self._begin())
-        self._is_new = False
+        params, tags = self._begin()
+        self._experiment.log(self.attach().run_id, params=params, tags=tags)
+        self._is_new, self._has_begun = False, True
 
-    def _begin(self, started: int | None = None, tags: Mapping[str, str] = {}) -> dict[str, str]:
-        """Create the run, or resume it; the params that it still lacks."""
+    def _begin(
+        self, started: int | None = None, tags: Mapping[str, str] = {}
+    ) -> tuple[Mapping[str, str], Mapping[str, str]]:
+        """Create the run, or resume it; the params and tags that it still lacks."""
         run_id, params = self.attach(started, tags).run_id, flat_params(self._info.config)
         if self._is_new:
-            return params
-        self._experiment.begin_run(run_id, {**self._tags(), **tags}, params)
-        return {}
+            return params, {}
+        tags = {**self._tags(), **tags}
+        if self._has_begun:
+            return {}, tags
+        self._experiment.begin_run(run_id, tags, params)
+        return {}, {}
 
     def _send_end(self, status: Status, time: int, tags: Mapping[str, str]) -> None:
         run_id = self.attach().run_id
-        self._log([])
-        self._experiment.set_tags(run_id, {**self._tags(), **tags})
+        self._log([], tags={**self._tags(), **tags})
+        self._has_begun = False
         self._experiment.client.set_terminated(run_id, status, time)
 
     def _send_stored(self, read: Callable[[], StoredRun]) -> None:
@@ -216,9 +222,9 @@ class RunQueue:
         self._read_policy = stored.read_policy
         times = [report.timestamp_ms for report in stored.reports] or [_now()]
         unfinished = {names.TAG_INCOMPLETE: "its policy is not uploaded yet"}
-        params = self._begin(times[0], {} if stored.read_policy is None else unfinished)
-        self._log(stored.reports, params)
-        self._is_new = False
+        left = self._begin(times[0], {} if stored.read_policy is None else unfinished)
+        self._log(stored.reports, *left)
+        self._is_new = self._has_begun = False
         self._experiment.client.set_terminated(self.attach().run_id, "FINISHED", times[-1])
 
     def _send_policy(self) -> None:
@@ -227,11 +233,16 @@ class RunQueue:
         run_id = self.attach().run_id
         if (policy := self._read_policy()) is not None:
             self._check_cancelled()
-            self._experiment.log_policy(run_id, policy)
+            self._experiment.log_policy(run_id, policy, self._tags())
         self._experiment.client.delete_tag(run_id, names.TAG_INCOMPLETE)
 
-    def _log(self, reports: Sequence[Report], params: Mapping[str, str] = {}) -> None:
-        """Log params, settings and the values that MLflow lacks, as a resumed run repeats steps."""
+    def _log(
+        self,
+        reports: Sequence[Report],
+        params: Mapping[str, str] = {},
+        tags: Mapping[str, str] = {},
+    ) -> None:
+        """Log settings and the values that MLflow lacks, as a resumed run repeats steps."""
         run_id = self.attach().run_id
         metrics = [
             Metric(name, value, report.timestamp_ms, report.env_steps)
@@ -253,7 +264,8 @@ class RunQueue:
         for begin in range(0, len(new) or 1, MAX_METRICS):
             self._check_cancelled()
             chunk = new[begin : begin + MAX_METRICS]
-            self._experiment.log(run_id, metrics=chunk, params=params if begin == 0 else {})
+            self._experiment.log(run_id, metrics=chunk, params=params, tags=tags)
+            params, tags = {}, {}
             self._last_steps.update((metric.key, metric.step) for metric in chunk)
 
     def _check_cancelled(self) -> None:
