@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 from sqlalchemy import create_engine
@@ -15,6 +17,7 @@ from sqlalchemy.engine import make_url
 
 from music_rllib.errors import TrackingError
 from music_rllib.store.storage import database_url, sqlite_url
+from music_rllib.tracking import sender
 from music_rllib.tracking import store as store_module
 from music_rllib.tracking.store import RECORD, SweepRecord, check_reachable, resolve_store
 from tests.ports import free_port
@@ -184,3 +187,27 @@ def test_a_server_that_refuses_says_why(status: int, body: bytes, reason: str) -
 def test_a_healthy_server_passes() -> None:
     with server_that_answers(200, b"OK") as uri:
         check_reachable(resolve_store(uri, "results"))
+
+
+class SlowRun:
+    """A run whose records take three seconds or more altogether."""
+
+    node_key, source, refused, is_running = "a", None, None, False
+    records = 30
+
+    def send(self, *, policy: bool) -> None:
+        while self.records:
+            time.sleep(0.1)
+            self.records -= 1
+
+
+def test_the_end_waits_for_mlflow_while_there_is_progress(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sender, "SAY_SECONDS", 0.2)
+    thread, run, said = sender.Sender("the store"), cast("Any", SlowRun()), list[int]()
+    thread.add(run)
+    thread.start()
+    assert not thread.flush(0.4), "without anybody to tell, this is the whole time"
+    assert thread.flush(2.0, said.append)
+    assert said == sorted(said, reverse=True)
+    assert len(said) > 1
+    thread.stop()
