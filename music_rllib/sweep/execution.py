@@ -116,8 +116,10 @@ def compute_and_report(
     with contextlib.nullcontext() if stopped_by else alone(storage, config.name, display.say):
         if not drivers.others():
             mlflow_log.log_postponed()
-        ended = "KILLED" if stopped_by else "FAILED" if failed else "FINISHED"
-        tracker.close(ended, say=None if stopped_by else say_left)
+        tracker.close(
+            "KILLED" if stopped_by else "FAILED" if failed else "FINISHED",
+            say=None if stopped_by else say_left,
+        )
         _show_results(console, opened, tracker, state_file, searches)
         if not stopped_by:
             uri = config.mlflow.tracking_uri
