@@ -158,7 +158,7 @@ def flops(
     inputs: int, actions: int, hidden: Sequence[int], batch: int, *, bootstrap: str = "value",
     critics: int = 2, target_critics: int | None = None, quantiles: int = 0,
     policy_critic: str = "min", policy_delay: int = 1,
-) -> float:  # fmt: skip
+) -> int:  # fmt: skip
     """Multiplications and additions of all matrix products that one update needs.
 
     An action of the policy has a gradient through its smallest critic only, unless their mean is
@@ -177,7 +177,7 @@ def flops(
     of_policy, of_value = layers(inputs, 2 * actions), layers(inputs, 1)
     critic = layers(inputs + actions, quantiles or 1)
     policy = cost(of_policy, "forward") + cost(of_policy, "weights hidden") / policy_delay
-    asked = critics * cost(critic, "forward")
+    asked: float = critics * cost(critic, "forward")
     improved = (critics if policy_critic == "mean" else 1) * cost(critic, "inputs") / policy_delay
     if bootstrap == "value":
         following = cost(of_value, trained) + cost(of_value, "forward")
@@ -185,7 +185,8 @@ def flops(
         following = (target_critics or critics) * cost(critic, "forward")
         following += cost(of_policy, "forward")
         asked /= policy_delay
-    return 2 * batch * (policy + following + critics * cost(critic, trained) + asked + improved)
+    trained_critics = critics * cost(critic, trained)
+    return round(2 * batch * (policy + following + trained_critics + asked + improved))
 
 
 def rows(repeats: int) -> Iterator[Row]:
@@ -224,7 +225,7 @@ def _against_own_products(
 ) -> Row:
     """Against as many products at the best rate as its networks need."""
     sizes = (INPUTS, ACTIONS, (128,) * 3, BATCH)
-    of_networks = {k: v for k, v in settings.items() if k in flops.__kwdefaults__}
+    of_networks = {k: v for k, v in settings.items() if k in (flops.__kwdefaults__ or {})}
     share = flops(*sizes, **of_networks) / flops(*sizes)
     floor = _floor(128, taken)
     products = [Taken(turn.wall * share, turn.cpu * share) for turn in taken[floor]]
