@@ -217,21 +217,29 @@ def _of_layer(normalized: Any, sizes: Array, layer: int, rows: int) -> Any:
 
 
 @compiled
-def _hidden(row: Array, bias: Array, normalized: Any, r: int) -> None:
-    """Bias, layer normalization and ReLU of row r."""
-    if normalized is None:
-        add_bias_relu(row, bias)
-    else:
-        add_bias(row, bias)
-        normalized.inverse_std[r] = layer_norm_relu(row, normalized.outputs[r])
+def _hidden(out: Array, bias: Array, normalized: Any) -> None:
+    """Bias, layer normalization and ReLU of [R, O]."""
+    for r in range(len(out)):
+        if normalized is None:
+            add_bias_relu(out[r], bias)
+        else:
+            add_bias(out[r], bias)
+            normalized.inverse_std[r] = layer_norm_relu(out[r], normalized.outputs[r])
 
 
 @compiled
-def _hidden_backward(gradient: Array, outputs: Array, normalized: Any, r: int) -> None:
-    """Derivative of `_hidden`, except for the bias."""
-    relu_backward(gradient, outputs)
-    if normalized is not None:
-        layer_norm_backward(gradient, normalized.outputs[r], normalized.inverse_std[r])
+def _hidden_backward(
+    gradient: Array, outputs: Array, normalized: Any, rows: Rows, learned: int, bias: Array
+) -> None:
+    """Derivative of `_hidden` at some rows; the bias receives that of the first ones."""
+    bias[:] = 0
+    for r in range(len(rows)):
+        relu_backward(gradient[r], outputs[rows[r]])
+        if normalized is not None:
+            kept, factor = normalized.outputs[rows[r]], normalized.inverse_std[rows[r]]
+            layer_norm_backward(gradient[r], kept, factor)
+        if r < learned:
+            add_bias(bias, gradient[r])
 
 
 @compiled
@@ -246,8 +254,7 @@ def forward(network: Network, inputs: Array) -> Array:
         linear(inputs, weights, network.by_outputs, out)
         if layer < last:
             normalized = _of_layer(network.normalized, network.sizes, layer, rows)
-            for r in range(rows):
-                _hidden(out[r], bias, normalized, r)
+            _hidden(out, bias, normalized)
         else:
             for r in range(rows):
                 add_bias(out[r], bias)
@@ -287,12 +294,8 @@ def backward(
         size = network.sizes[layer]
         out = scratch[layer % 2, : len(rows) * size].reshape((len(rows), size))
         linear_backward_inputs(gradient, weights, network.by_outputs, out)
-        bias = _bias(network, network.gradients, layer - 1)
-        bias[:] = 0
         normalized = _of_layer(network.normalized, network.sizes, layer - 1, len(inputs))
-        for r in range(len(rows)):
-            _hidden_backward(out[r], below[rows[r]], normalized, rows[r])
-            if r < learned:
-                add_bias(bias, out[r])
+        bias = _bias(network, network.gradients, layer - 1)
+        _hidden_backward(out, below, normalized, rows, learned, bias)
         gradient = out
     return gradient
