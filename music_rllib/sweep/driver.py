@@ -21,14 +21,17 @@ from music_rllib.config.load import load_config, warnings_of
 from music_rllib.config.schema import MlflowSettings, SweepConfig
 from music_rllib.envs.tasks import search_in
 from music_rllib.errors import BadInputError
-from music_rllib.experiment.environments import (
+from music_rllib.experiment.open_sweep import (
+    OpenSweep,
     accept_environments,
     changed_text,
     decide,
     found_runs,
+    open_sweep,
+    remove_damaged,
     remove_runs,
+    reopened,
 )
-from music_rllib.experiment.open_sweep import OpenSweep, open_sweep, remove_damaged, reopened
 from music_rllib.experiment.plan import make_plan, shared_runs
 from music_rllib.experiment.record import changes_since, continued_runs_text, keep_record
 from music_rllib.experiment.sweep_files import ANALYSIS_PLAN, STATE

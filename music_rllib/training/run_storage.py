@@ -21,7 +21,7 @@ from music_rllib.envs.fingerprint import (
     fingerprint_of,
     on_another_machine,
 )
-from music_rllib.experiment.environments import ADVICE, EnvironmentChangedError
+from music_rllib.experiment.open_sweep import ADVICE, EnvironmentChangedError
 from music_rllib.experiment.plan import budget_settings, continuation_key, is_continuable
 from music_rllib.runtime.machine import provenance_tags
 from music_rllib.store.handoff import NetworkWeights, read_handoff, write_handoff

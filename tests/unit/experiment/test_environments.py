@@ -11,14 +11,16 @@ import yaml
 from music_rllib.config.load import load_config
 from music_rllib.envs.fingerprint import Fingerprint
 from music_rllib.errors import BadInputError
-from music_rllib.experiment.environments import (
+from music_rllib.experiment.open_sweep import (
+    FoundRun,
+    OpenSweep,
     accept_environments,
     changed_text,
+    decide,
     found_runs,
+    open_sweep,
     remove_runs,
-    to_retrain,
 )
-from music_rllib.experiment.open_sweep import OpenSweep, open_sweep
 from music_rllib.experiment.plan import Node, continuation_key, make_plan
 from music_rllib.experiment.scheduler import Status
 from music_rllib.results.analysis import mixed
@@ -77,6 +79,10 @@ def text_of(sweep: OpenSweep) -> str | None:
     return changed_text(sweep, found_runs(sweep))
 
 
+def again_of(sweep: OpenSweep, retrain: list[str], *, all_changed: bool = False) -> list[FoundRun]:
+    return decide(sweep, found_runs(sweep), retrain, all_changed=all_changed, keep=True)[0]
+
+
 @pytest.mark.parametrize("name", ["s", "another"])
 def test_a_changed_environment_is_named_with_its_runs_and_under_every_name(
     tmp_path: Path, name: str
@@ -106,7 +112,7 @@ def test_checkpoints_and_ends_of_shorter_runs_are_checked(tmp_path: Path) -> Non
     longer = opened(tmp_path, NEW, env_steps=800)
     assert "is at 200 env steps" in str(text_of(longer))
     assert text_of(opened(tmp_path, OLD, env_steps=800)) is None
-    remove_runs(longer, to_retrain(longer, found_runs(longer), ["Lab"], all_changed=False), print)
+    remove_runs(longer, again_of(longer, ["Lab"]), print)
     assert not found_runs(longer)
     assert not place.names()
 
@@ -115,16 +121,13 @@ def test_runs_that_start_from_a_retrained_run_are_retrained(tmp_path: Path) -> N
     finished(tmp_path)
     sweep = opened(tmp_path, NEW)
     pretrain, finetune = sweep.plan.nodes
-    runs = found_runs(sweep)
-    assert not to_retrain(sweep, runs, [], all_changed=False)
-    again = to_retrain(sweep, runs, [], all_changed=True)
+    assert not again_of(sweep, [])
+    again = again_of(sweep, [], all_changed=True)
     assert [run.label for run in again] == [pretrain.label, finetune.label]
-    assert to_retrain(sweep, runs, ["pretrain/seed0"], all_changed=False) == again
-    assert [r.label for r in to_retrain(sweep, runs, ["Field"], all_changed=False)] == [
-        finetune.label
-    ]
+    assert again_of(sweep, ["pretrain/seed0"]) == again
+    assert [r.label for r in again_of(sweep, ["Field"])] == [finetune.label]
     with pytest.raises(BadInputError, match=r"--retrain must name a task or a run .* got 'Fild'"):
-        to_retrain(sweep, runs, ["Fild"], all_changed=False)
+        again_of(sweep, ["Fild"])
     lease = Lease.of_this_process("sweep 'other'")
     work = sweep.store.work_folder(finetune.key).lease
     assert work.acquire(lease) is None

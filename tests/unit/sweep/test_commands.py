@@ -21,8 +21,13 @@ from music_rllib.config.load import load_config
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.experiment import open_sweep as open_sweep_module
 from music_rllib.experiment import sweep_files
-from music_rllib.experiment.environments import changed_text, found_runs
-from music_rllib.experiment.open_sweep import OpenSweep, open_sweep, remove_damaged
+from music_rllib.experiment.open_sweep import (
+    OpenSweep,
+    changed_text,
+    found_runs,
+    open_sweep,
+    remove_damaged,
+)
 from music_rllib.experiment.plan import Node, continuation_key, make_plan
 from music_rllib.experiment.record import changes_since, continued_runs_text, keep_record
 from music_rllib.experiment.scheduler import Status
