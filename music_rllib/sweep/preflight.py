@@ -225,6 +225,8 @@ def find_cluster(
     address = cluster_address()
     if address is None or (opened.scheduler.complete and (begun or not opened.plan.searched)):
         return None
+    if "RAY_JOB_CONFIG_JSON_ENV_VAR" in os.environ:
+        return None  # Ray deletes the working folder of a job that disconnects
     check_reachable(address)
     from music_rllib.runtime.ray_cluster import cluster
 
