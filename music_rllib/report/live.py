@@ -172,6 +172,7 @@ class Server(ThreadingHTTPServer):
     """Answers each connection in a thread."""
 
     daemon_threads = True
+    request_queue_size = 128  # with the default of 5, a client waits seconds in a burst
 
     def __init__(self, *arguments: Any) -> None:
         self._open: list[socket.socket] = []

@@ -7,10 +7,8 @@ import logging
 import os
 import re
 import shutil
-import sqlite3
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import closing
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Literal, NamedTuple
@@ -34,7 +32,7 @@ from music_rllib import names
 from music_rllib.errors import TrackingError
 from music_rllib.redaction import redact
 from music_rllib.tracking.policy_model import MODEL_NAME, write_model
-from music_rllib.tracking.store import TrackingStore
+from music_rllib.tracking.store import TrackingStore, empty_database, keep_empty_database
 
 MAX_METRICS, MAX_PARAMS = 1000, 100
 """MLflow's limits for one request: metrics, or metrics, params and tags together; and params."""
@@ -384,40 +382,14 @@ def open_client(store: TrackingStore) -> MlflowClient:
             is_new = not store.database.exists()
             if is_new:
                 with contextlib.suppress(OSError, RuntimeError):
-                    shutil.copyfile(_empty_database(), store.database)
+                    shutil.copyfile(empty_database(VERSION), store.database)
             client = MlflowClient(store.uri)
             client.search_experiments(max_results=1)
             if is_new:
-                _keep_empty_database(store.database)
+                keep_empty_database(store.database, VERSION)
             return client
     except (OSError, TimeoutError) as error:
         raise TrackingError(
             f"{store.database} must be writable for the local MLflow store: {error}. "
             "Choose another storage folder or name a server in mlflow.tracking_uri."
         ) from error
-
-
-def _empty_database() -> Path:
-    """File in the user's cache with this MLflow's tables, which take 2 s of CPU time to create."""
-    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(cache, "music_rllib", f"mlflow-{VERSION}.db")
-
-
-def _keep_empty_database(database: Path) -> None:
-    """Put an empty copy of a new database into the cache, if it is writable."""
-    with contextlib.suppress(OSError, RuntimeError, sqlite3.Error):
-        kept = _empty_database()
-        if kept.exists():
-            return
-        kept.parent.mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory(dir=kept.parent) as folder:
-            copy = Path(folder, "empty.db")
-            with (
-                closing(sqlite3.connect(database)) as source,
-                closing(sqlite3.connect(copy)) as target,
-            ):
-                source.backup(target)
-                # MLflow creates its default experiment again, with this store's artifact folder.
-                target.execute("DELETE FROM experiments")
-                target.commit()
-            copy.replace(kept)

@@ -5,13 +5,17 @@ Loading this module does not load MLflow.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shlex
 import shutil
 import socket
+import sqlite3
 import sys
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Self
 from urllib.parse import urlsplit
 
@@ -253,3 +257,29 @@ def _reason(store: TrackingStore, error: requests.RequestException) -> str:
     if "refused" in str(error):
         return "the connection was refused"
     return f"no connection ({redact(str(error))})"
+
+
+def empty_database(version: str) -> Path:
+    """File in the user's cache with MLflow's tables, which take 2 s of CPU time to create."""
+    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(cache, "music_rllib", f"mlflow-{version}.db")
+
+
+def keep_empty_database(database: Path, version: str) -> None:
+    """Put an empty copy of a new database into the cache, if it is writable."""
+    with contextlib.suppress(OSError, RuntimeError, sqlite3.Error):
+        kept = empty_database(version)
+        if kept.exists():
+            return
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(dir=kept.parent) as folder:
+            copy = Path(folder, "empty.db")
+            with (
+                closing(sqlite3.connect(database)) as source,
+                closing(sqlite3.connect(copy)) as target,
+            ):
+                source.backup(target)
+                # MLflow creates its default experiment again, with this store's artifact folder.
+                target.execute("DELETE FROM experiments")
+                target.commit()
+            copy.replace(kept)

@@ -37,11 +37,12 @@ OTHERS = {
     "docker",
     "export",
     "grafana",
+    "head",
     "kubectl",
     "mlflow",
     "pip",
     "prometheus",
-    "head",
+    "sbatch",
 } | {
     "mkdir",
     "optuna-dashboard",
