@@ -25,7 +25,7 @@ from music_rllib.redaction import for_people
 from music_rllib.report import cli as report
 from music_rllib.runtime.quiet import prepare_environment, quiet_third_parties
 from music_rllib.serve import command as serve
-from music_rllib.sweep.commands import evaluate, files, run, status
+from music_rllib.sweep.commands import evaluate, files, run, slurm, status
 
 COMMANDS: dict[str, tuple[Callable[..., int], str]] = {
     "run": (run.run, run.RUN_EXAMPLES),
@@ -36,6 +36,7 @@ COMMANDS: dict[str, tuple[Callable[..., int], str]] = {
     "compare": (status.compare, status.COMPARE_EXAMPLES),
     "best": (files.best, files.BEST_EXAMPLES),
     "evaluate": (evaluate.evaluate, evaluate.EXAMPLES),
+    "slurm": (slurm.slurm, slurm.EXAMPLES),
     "clean": (files.clean, files.CLEAN_EXAMPLES),
     "init": (files.init, files.INIT_EXAMPLES),
     "presets": (files.presets, files.PRESETS_EXAMPLES),

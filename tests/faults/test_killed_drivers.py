@@ -8,15 +8,15 @@ import random
 import re
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
 
+from music_rllib.program import main
 from music_rllib.tune.events import RESTARTS
 from tests.faults import comparison, sweeps
-from tests.integration.conftest import REPOSITORY, Program
+from tests.integration.conftest import Program, call
 
 
 @pytest.mark.thorough
@@ -138,24 +138,25 @@ def test_killed_twenty_times_at_random_moments(program: Program, unbroken: Path)
 def test_an_array_of_tasks_is_stopped_killed_and_requeued(
     program: Program, unbroken: Path, tmp_path: Path
 ) -> None:
-    """`cluster/slurm.sh` with three tasks: one gets SIGTERM, one is killed, one stays."""
+    """The script of `slurm` with three tasks: one gets SIGTERM, one is killed, one stays."""
     stubs = tmp_path / "stubs"
     stubs.mkdir()
-    python = f'#!/bin/sh\nexec {sys.executable} -m music_rllib "$@"\n'
-    requeue = f'#!/bin/sh\necho "$@" >> {tmp_path}/requeued\n'
-    for name, script in (("music-rllib", python), ("scontrol", requeue)):
-        (stubs / name).write_text(script)
-        (stubs / name).chmod(0o755)
+    (stubs / "scontrol").write_text(f'#!/bin/sh\necho "$@" >> {tmp_path}/requeued\n')
+    (stubs / "scontrol").chmod(0o755)
+    written = call(main, program.folder, "slurm", program.file, "--storage", "results")
+    assert written[::2] == (0, "")
+    (script,) = program.folder.glob("*.slurm.sh")
 
     def task(number: int) -> subprocess.Popen[bytes]:
         environment = program.environment | {
             "PATH": f"{stubs}:{os.environ['PATH']}",
             "SLURM_JOB_ID": str(number),
+            "SLURM_ARRAY_TASK_ID": str(number),
             "SLURM_CPUS_PER_TASK": "1",
         }
         with (tmp_path / f"{number}.log").open("ab") as log:
             return subprocess.Popen(
-                ["sh", REPOSITORY / "cluster/slurm.sh", program.file, "--storage", "results"],
+                ["sh", script],
                 cwd=program.folder,
                 env=environment,
                 stdout=log,

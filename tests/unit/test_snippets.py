@@ -42,7 +42,8 @@ OTHERS = {
     "mlflow",
     "pip",
     "prometheus",
-    "sbatch",
+    "sacct",
+    "squeue",
 } | {
     "mkdir",
     "optuna-dashboard",

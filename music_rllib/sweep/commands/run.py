@@ -147,7 +147,7 @@ def run(
     from music_rllib.sweep import driver
 
     return driver.run(
-        _load(config, overrides, storage, name, seeds),
+        load(config, overrides, storage, name, seeds),
         accept_changes=accept_changes,
         retrain=retrain or (),
         keep_runs=keep_runs,
@@ -179,7 +179,7 @@ def plan(
     """
     from music_rllib.sweep import driver
 
-    sweep = _load(config, overrides, storage, name, seeds)
+    sweep = load(config, overrides, storage, name, seeds)
     return driver.plan(sweep, measure=measure, as_json=json)
 
 
@@ -209,14 +209,18 @@ def resume(
     )
 
 
-def _load(
+def load(
     config: Path | None,
     overrides: list[str] | None,
     storage: str | None,
     name: str | None,
     seeds: str | None,
 ) -> SweepConfig:
-    """The sweep; a first argument with a `=` that is not a file is an override."""
+    """The sweep; a first argument with a `=` that is not a file is an override.
+
+    Raises:
+        ConfigError: The file or an override is wrong.
+    """
     from music_rllib.sweep import driver
 
     overrides = overrides or []

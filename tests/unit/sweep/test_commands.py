@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
+import os
+import shutil
 import signal
+import subprocess
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -79,6 +83,8 @@ class Said:
 
 Program = Callable[..., Said]
 
+
+ROOT = Path(__file__).parents[3]
 
 IN_A_BUCKET = pytest.mark.parametrize("storage", ["folder", "bucket"], indirect=True)
 """For tests of commands that read, write or delete in the storage themselves."""
@@ -899,3 +905,37 @@ def test_a_report_made_on_another_machine_can_be_opened_on_this_one() -> None:
     ]
     assert lines[2].startswith("Report: /head/r/index.html (on ")
     assert execution.elsewhere("error: no", "s3://b/s") == []
+
+
+def test_slurm_writes_a_job_array_and_submits_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: Program
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(ROOT / "tune_configs" / "smoke.yaml", "my sweep.yaml")
+    command = ["slurm", "my sweep.yaml", "seeds=3", "--array=8", "--time=1-12", "--sbatch=-A me"]
+    assert "sbatch --array=1-8 smoke.slurm.sh" in program(*command).output
+    body = Path("smoke.slurm.sh").read_text()
+    options = set(itertools.takewhile(lambda line: line.startswith("#"), body.splitlines()))
+    assert {"#SBATCH --job-name=smoke", "#SBATCH --time=1-12", "#SBATCH -A me"} <= options
+    assert "-m music_rllib run 'my sweep.yaml' seeds=3\n" in body
+    assert subprocess.run(["sh", "-n", "smoke.slurm.sh"], check=False).returncode == 0
+
+    stub = tmp_path / "bin" / "sbatch"
+    stub.parent.mkdir()
+    stub.write_text('#!/bin/sh\necho "$@" >> submitted; wc -l < submitted\n')
+    stub.chmod(0o755)
+    monkeypatch.setenv("PATH", str(stub.parent), prepend=os.pathsep)
+    assert "job 1 (8 tasks), then job 2" in program(*command, "--submit").output
+    first, second = Path("submitted").read_text().splitlines()
+    assert first == "--parsable --array=1-8 smoke.slurm.sh"
+    assert second == "--parsable --dependency=afterany:1 smoke.slurm.sh"
+    stub.write_text("#!/bin/sh\necho no such partition >&2; exit 1\n")
+    refused = program(*command, "--submit")
+    assert (refused.code, "no such partition" in refused.errors) == (2, True)
+
+    Path("smoke.slurm.sh").write_text("mine")
+    refused = program(*command)
+    assert (refused.code, "must not be a file of another origin" in refused.errors) == (2, True)
+    for wrong, said in (("--time=5h", "--time must be a time of Slurm"), ("tac.gamma=7", "< 1")):
+        refused = program(*command, wrong)
+        assert (refused.code, said in refused.errors) == (2, True)
