@@ -575,15 +575,6 @@ def test_settings_are_validated_once_until_one_of_them_changes() -> None:
     assert config.training(entropic_index=2.0).settings.tac.entropic_index == 2.0
 
 
-def test_tune_searches_over_settings_of_tac(tmp_path: Path) -> None:
-    config = TACConfig().environment("Pendulum-v1").env_runners(num_envs_per_env_runner=1)
-    config.training(**{**SMALL, "entropic_index": tune.grid_search([1.0, 1.5])})
-    stop = {"training_iteration": 1}
-    run_config = tune.RunConfig(stop=stop, storage_path=str(tmp_path), verbose=0)
-    results = tune.Tuner(TAC, param_space=config, run_config=run_config).fit()
-    used = [
-        result.metrics["learners"]["default_policy"][names.ENTROPIC_INDEX] for result in results
-    ]
-    assert sorted(used) == [1.0, 1.5]
+def test_a_misspelled_setting_of_a_tune_trial_is_refused() -> None:
     with pytest.raises(ValueError, match="unknown settings in the config: entropic_indx"):
         TACConfig().update_from_dict({"entropic_indx": 2.0})

@@ -100,7 +100,7 @@ def test_wheel_holds_the_whole_package_and_nothing_else(unpacked: Path) -> None:
     wanted = {
         path.relative_to(ROOT).as_posix()
         for path in (ROOT / "music_rllib").rglob("*")
-        if path.suffix in {".css", ".html", ".js", ".json", ".md", ".py", ".yaml"}
+        if path.suffix in {".css", ".html", ".js", ".json", ".md", ".py", ".sh", ".yaml"}
         or path.name == "py.typed"
     }
     packed = {path.relative_to(unpacked) for path in unpacked.rglob("*") if path.is_file()}

@@ -14,13 +14,13 @@ quiet_third_parties()
 
 import logging
 import gymnasium
-import gymnasium_robotics
 import ray
+from music_rllib.envs.tasks import register_robotics
 from ray.rllib.algorithms.ppo import PPOConfig
 
 
 def work(where):
-    gymnasium.register_envs(gymnasium_robotics)
+    register_robotics()
     gymnasium.make("FetchPush-v4").close()
     config = PPOConfig().environment("Pendulum-v1").env_runners(num_env_runners=0)
     config.build_algo().stop()
