@@ -37,12 +37,16 @@ $(STAMP): pyproject.toml constraints.txt
 	  { echo "music_rllib needs Python >= 3.11; '$(PYTHON)' is $$("$(PYTHON)" -V 2>&1). Say 'make PYTHON=/path/to/python'." >&2; exit 1; }
 	@"$(PYTHON)" -c 'import venv, ensurepip' 2>/dev/null || \
 	  { echo "'$(PYTHON)' has no venv module (on Debian and Ubuntu: apt-get install python3-venv)." >&2; exit 1; }
-	@echo "[1/3] creating $(VENV) with $$("$(PYTHON)" -V 2>&1)"
+	@echo "[1/4] creating $(VENV) with $$("$(PYTHON)" -V 2>&1)"
 	@"$(PYTHON)" -m venv "$(VENV)"
-	@echo "[2/3] installing torch"
+	@echo "[2/4] installing torch"
 	@$(BIN)/python -m pip install -qq -c constraints.txt torch
-	@echo "[3/3] installing Ray, MuJoCo, MLflow and the rest (a few minutes)"
+	@echo "[3/4] installing Ray, MuJoCo, MLflow and the rest (a few minutes)"
 	@$(BIN)/python -m pip install -qq -c constraints.txt -e '.[dev]'
+	@echo "[4/4] compiling the updates of the packaged sweep (a minute)"
+	@folder=$$(mktemp -d); \
+	  $(BIN)/python -m music_rllib plan --measure --storage "$$folder" >/dev/null || \
+	  echo "They could not be compiled now: the first run does it." >&2; rm -rf "$$folder"
 	@touch $@
 	@echo "$(VENV) is ready"
 
