@@ -24,6 +24,17 @@ BUILT_IN: Mapping[str, str] = MappingProxyType(
     }
 )
 """Values of `intrinsic.reward` and the classes that they stand for."""
+SETTINGS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "rnd": ("hidden", "features"),
+        "icm": ("hidden", "features"),
+        "disagreement": ("models", "hidden"),
+        "e3b": ("hidden", "features", "ridge"),
+        "diayn": ("skills", "hidden"),
+        "discern": ("hidden", "features", "beta"),
+    }
+)
+"""Keyword arguments of these classes, which are numbers; reading them there would load PyTorch."""
 
 
 def _known_reward(name: str) -> str:
@@ -50,6 +61,20 @@ class IntrinsicSettings(StrictModel):
     """Keyword arguments of its class, such as `{hidden: 128}`."""
     frozen: bool = False
     """Whether its networks are of another run and not trained; fixed by the variant."""
+
+    @model_validator(mode="after")
+    def _settings_of_the_class(self) -> Self:
+        if self.reward in BUILT_IN:
+            known = SETTINGS.get(self.reward, ())
+            for name, value in self.settings.items():
+                if name not in known:
+                    raise ValueError(
+                        f"settings of {self.reward} must be among: {', '.join(known) or 'none'}; "
+                        f"got {name!r}"
+                    )
+                if isinstance(value, bool) or not isinstance(value, int | float) or value <= 0:
+                    raise ValueError(f"settings.{name} must be a number > 0, got {value!r}")
+        return self
 
     @property
     def identity(self) -> str:

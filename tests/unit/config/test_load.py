@@ -440,6 +440,14 @@ BAD: list[tuple[Document, str]] = [
     (with_stage(1, music={"bound": "nwj"}), "needs the same music.bound in stage finetune as in"),
     (with_stage(0, intrinsic={"reward": "rdn"}), "intrinsic.reward must be displacement, random"),
     (with_stage(0, intrinsic={"reward": "a b:C"}), "or module:Class of your own, got 'a b:C'"),
+    (
+        with_stage(0, intrinsic={"reward": "rnd", "settings": {"hiden": 9}}),
+        "settings of rnd must be among: hidden, features; got 'hiden'",
+    ),
+    (
+        with_stage(0, intrinsic={"reward": "e3b", "settings": {"ridge": 0}}),
+        "settings.ridge must be a number > 0, got 0",
+    ),
     (with_stage(0, intrinsic={"weight": -1.0}), "intrinsic.weight must be >= 0, got -1"),
     (with_stage(0, intrinsic={"frozen": True}), "intrinsic.frozen must be false for music-u, got"),
     (

@@ -1,5 +1,7 @@
 """Intrinsic rewards other than MUSIC's: an oracle for each, their scale, exact resume."""
 
+import importlib
+import inspect
 import math
 from pathlib import Path
 from typing import Any
@@ -10,7 +12,7 @@ from torch import Tensor
 
 from music_rllib.intrinsic.interface import Batch, IntrinsicReward, Sizes
 from music_rllib.intrinsic.relabeling import RewardLearner, make_reward, reward_class
-from music_rllib.intrinsic.settings import BUILT_IN, IntrinsicSettings
+from music_rllib.intrinsic.settings import BUILT_IN, SETTINGS, IntrinsicSettings
 from music_rllib.store.serialization import read_state, write_state
 
 SIZES = Sizes(6, 3, 2, (0, 1, 2), (3, 4, 5))
@@ -210,7 +212,7 @@ def test_frozen_rewards_keep_the_networks_and_the_scale_of_their_source(name: st
     [
         ("no_such_module:Mine", {}, r"^intrinsic\.reward must be importable, got 'no_such"),
         (f"{__name__}:batch", {}, "must name a subclass of IntrinsicReward"),
-        ("rnd", {"hiden": 3}, r"^intrinsic\.settings must fit rnd: .*hiden"),
+        (f"{__name__}:Speed", {"facter": 3}, r"^intrinsic\.settings must fit .*Speed: .*facter"),
         ("diayn", {"skills": 1}, r"^intrinsic\.settings\.skills must be >= 2, got 1"),
     ],
 )
@@ -227,3 +229,10 @@ def test_a_bonus_of_another_shape_is_refused_instead_of_broadcast() -> None:
     with pytest.raises(ValueError, match=r"of shape \(64,\), got shape \(64, 1\)"):
         RewardLearner(Column(SIZES), 1e-3, frozen=False).learn(batch(), 1)
     assert reward_class(OWN).__name__ == "Speed"
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_the_checked_settings_are_those_of_the_class(name: str) -> None:
+    module, _, cls = BUILT_IN[name].partition(":")
+    signature = inspect.signature(getattr(importlib.import_module(module), cls))
+    assert tuple(signature.parameters)[1:] == SETTINGS.get(name, ())
