@@ -199,9 +199,10 @@ def in_one_line(text: str) -> str:
 
 
 def test_compare_and_the_report_say_the_same_of_the_same_sweep(
-    storage: str, tmp_path: Path, program: Program
+    storage: str, tmp_path: Path, program: Program, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Intervals, comparisons, unfinished seeds, words: there is one definition."""
+    monkeypatch.setenv("COLUMNS", "160")  # cells of narrower tables have several lines
     tasks, seeds = ["FetchPush", "FetchSlide"], list(range(6))
     sweep = opened(storage, tmp_path, tasks=tasks, seeds=seeds)
     unfinished = {(1.5, "FetchSlide", 5), (1.5, "FetchPush", 2), (2.0, "FetchPush", 0)}
