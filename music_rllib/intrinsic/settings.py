@@ -64,7 +64,7 @@ class IntrinsicSettings(StrictModel):
 
     @model_validator(mode="after")
     def _settings_of_the_class(self) -> Self:
-        if self.reward in BUILT_IN:
+        if self.reward is not None and self.reward in BUILT_IN:
             known = SETTINGS.get(self.reward, ())
             for name, value in self.settings.items():
                 if name not in known:
