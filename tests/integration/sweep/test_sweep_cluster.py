@@ -86,7 +86,6 @@ def head_node(home: Path, cpus: int, workers: Sequence[int] = ()) -> Iterator[He
     environment = without_loopback_only() | {
         "PATH": f"{BIN}{os.pathsep}{os.environ['PATH']}",
         "HOME": str(home),
-        "PYTHONPATH": str(ENVIRONMENTS),
         "RAY_AUTH_MODE": "token",
         "RAY_AUTH_TOKEN": TOKEN,
         "MLFLOW_TRACKING_PASSWORD": "planted-mlflow-password",
@@ -160,13 +159,13 @@ def small(document: dict[str, Any]) -> dict[str, Any]:
 def run_sweep(
     head: Head, document: dict[str, Any], folder: Path, command: str = "run"
 ) -> subprocess.CompletedProcess[str]:
-    """With `RAY_ADDRESS`, from a folder of the user's."""
+    """With `RAY_ADDRESS`, from a folder of the user's, which has the environment's module."""
     (folder / "sweep.yaml").write_text(yaml.safe_dump(document, sort_keys=False))
-    path = os.pathsep.join((str(REPOSITORY), str(ENVIRONMENTS)))
+    shutil.copy(ENVIRONMENTS / "point_env.py", folder)
     return subprocess.run(
         [sys.executable, "-m", "music_rllib.sweep", command, "sweep.yaml"],
         cwd=folder,
-        env=head.environment | {"RAY_ADDRESS": head.address, "PYTHONPATH": path},
+        env=head.environment | {"RAY_ADDRESS": head.address, "PYTHONPATH": str(REPOSITORY)},
         capture_output=True,
         text=True,
         timeout=280,
