@@ -30,7 +30,7 @@ class Displacement(IntrinsicReward):
 
 
 class RandomBonus(IntrinsicReward):
-    """Uniform noise on [0, 1], drawn anew for each sampled transition."""
+    """A uniform random number on [0, 1] for each sampled transition."""
 
     scale: ClassVar[float | None] = 1.0
 

@@ -5,6 +5,7 @@ Shape legend: B transitions, N trajectories, T frames, D observation, G goal, A 
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import ClassVar, NamedTuple
@@ -39,14 +40,14 @@ class Batch(NamedTuple):
     generator: torch.Generator
     """The source of all random numbers, so that a resumed run draws the same ones."""
     stored: Tensor | None = None
-    """[B] results of `of_episode`, with `by_episode`."""
+    """[B] results of `of_episode`, if it is overridden."""
     trajectories: Tensor | None = None
     """[N, T, D] observations of whole trajectories, with `trajectories`."""
     inside: Tensor | None = None
     """[N, T] False for padding at a trajectory's end; None: no padding."""
 
 
-class IntrinsicReward(nn.Module):
+class IntrinsicReward(nn.Module, ABC):
     """A bonus for transitions, and the loss of its networks.
 
     Only `bonus` must be written. Parameters and buffers are saved in checkpoints, and handed over
@@ -67,7 +68,7 @@ class IntrinsicReward(nn.Module):
     smallest_scale: ClassVar[float] = 0.0
     """Lower limit of that scale, so that noise earns nothing if there is nothing else."""
     by_episode: ClassVar[bool] = False
-    """Whether bonuses depend on the earlier steps of an episode; see `of_episode`."""
+    """Whether the class overrides `of_episode`."""
     trajectories: ClassVar[int] = 0
     """Number of whole trajectories that the loss of each update needs."""
     sums: Tensor
@@ -78,21 +79,24 @@ class IntrinsicReward(nn.Module):
         self.sizes = sizes
         self.register_buffer("sums", torch.zeros(2, dtype=torch.float64))
 
+    def __init_subclass__(cls) -> None:
+        cls.by_episode = cls.of_episode is not IntrinsicReward.of_episode
+
+    @abstractmethod
     def bonus(self, batch: Batch) -> Tensor:
         """[B] bonuses >= 0, of any scale; called without gradients."""
-        raise NotImplementedError
 
     def loss(self, batch: Batch) -> Tensor | None:
         """[] loss of the parameters, for a step of Adam at every fourth update; None: no step."""
         return None
 
-    @torch.no_grad()
-    def of_episode(self, observations: Tensor, actions: Tensor) -> Tensor:
-        """[n+1, D], [n, A] -> [n] numbers of a fresh episode, for `Batch.stored`.
+    def of_episode(self, observations: Tensor, actions: Tensor) -> Tensor | None:
+        """[n+1, D], [n, A] -> [n] numbers of a fresh episode, for `Batch.stored`; None: none.
 
-        Called once for each episode, with `by_episode`; the replay keeps the numbers.
+        Override it if bonuses depend on the earlier steps of an episode. It is called once for each
+        episode, without gradients, and the replay keeps the numbers.
         """
-        raise NotImplementedError
+        return None
 
     def metrics(self) -> dict[str, float]:
         """Measures since the last call; their names begin with `intrinsic/`."""

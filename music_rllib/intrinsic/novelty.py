@@ -137,8 +137,6 @@ class E3B(_InverseModel):
     https://arxiv.org/abs/2210.05805, eq. 1. Bonuses are computed when an episode ends.
     """
 
-    by_episode = True
-
     def __init__(
         self, sizes: Sizes, *, hidden: int = 64, features: int = 16, ridge: float = 0.1
     ) -> None:

@@ -6,6 +6,7 @@ Shape legend: K updates of a call, B transitions of one.
 from __future__ import annotations
 
 import importlib
+import inspect
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -39,6 +40,8 @@ def reward_class(name: str) -> type[IntrinsicReward]:
         raise ValueError(
             f"intrinsic.reward must name a subclass of IntrinsicReward in {module}, got {name!r}"
         )
+    if inspect.isabstract(found):
+        raise ValueError(f"intrinsic.reward must have a method bonus, which {name} lacks")
     return found
 
 
@@ -91,13 +94,14 @@ class RewardLearner:
         )  # fmt: skip
 
     def values_of(self, episodes: Sequence[Trajectory]) -> list[Floats]:
-        """[n] numbers of each episode for the replay, with `by_episode`."""
+        """[n] numbers of each episode for the replay, if there are any."""
         width, device = self.reward.sizes.observation, self.reward.sums.device
         found = []
         for episode in episodes:
             arrays = (episode.frames[:, :width], episode.actions)
             with torch.no_grad():
                 values = self.reward.of_episode(*(torch.tensor(a, device=device) for a in arrays))
+            assert values is not None
             found.append(values.cpu().numpy())
         return found
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from music_rllib.intrinsic.interface import Batch, IntrinsicReward, Sizes
+from music_rllib.intrinsic.novelty import E3B
 from music_rllib.intrinsic.relabeling import RewardLearner, make_reward, reward_class
 from music_rllib.intrinsic.settings import BUILT_IN, SETTINGS, IntrinsicSettings
 from music_rllib.store.serialization import read_state, write_state
@@ -110,9 +111,10 @@ def test_icm_stays_high_for_unpredictable_dynamics() -> None:
 
 def test_e3b_equals_its_closed_form() -> None:
     e3b = made("e3b", ridge=0.5).reward
+    assert isinstance(e3b, E3B)
     frames, actions = torch.randn(9, 6), torch.randn(8, 2)
     found = e3b.of_episode(frames, actions).double()
-    features = e3b.encode(frames).detach().double()  # type: ignore[operator]
+    features = e3b.encode(frames).detach().double()
     for t in range(8):
         so_far = features[: t + 1]
         inverse = torch.linalg.inv(so_far.T @ so_far + 0.5 * torch.eye(16).double())
@@ -212,6 +214,7 @@ def test_frozen_rewards_keep_the_networks_and_the_scale_of_their_source(name: st
     [
         ("no_such_module:Mine", {}, r"^intrinsic\.reward must be importable, got 'no_such"),
         (f"{__name__}:batch", {}, "must name a subclass of IntrinsicReward"),
+        (f"{__name__}:IntrinsicReward", {}, "must have a method bonus, which .* lacks"),
         (f"{__name__}:Speed", {"facter": 3}, r"^intrinsic\.settings must fit .*Speed: .*facter"),
         ("diayn", {"skills": 1}, r"^intrinsic\.settings\.skills must be >= 2, got 1"),
     ],

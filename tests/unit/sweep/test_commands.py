@@ -216,7 +216,7 @@ def test_compare_and_the_report_say_the_same_of_the_same_sweep(
     logged = read_sweep(f"{storage}/mine").sweep
     text = program("compare", f"{storage}/mine").output
     finals, *_ = performance_tables(analyse(logged))
-    # Seeds that have finished on one of two tasks count there, and not over both.
+    # A seed that has finished on one of two tasks counts for that task only.
     assert [row[-1] for row in finals.rows] == [12, 8, 10, 6, 5, 5, 6, 5, 6]
     for row in finals.cells:
         assert in_one_line(" ".join(cell.text for cell in row)) in in_one_line(text)
