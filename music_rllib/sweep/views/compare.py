@@ -66,13 +66,16 @@ class Comparison:
         if self.final is None:
             text = f"Stage {self.stage} of {self.sweep.name} has no finished run yet."
             return Group(Text(text), *earlier)
-        lines = [*map(Text, answer(self.sweep, self.study)), *earlier, Text()]
+        lines: list[RenderableType] = [*map(Text, answer(self.sweep, self.study)), *earlier, Text()]
         lines += [Text(line, style="yellow") for line in self.environments]
         finals, entropies, *_ = performance_tables([self.final])
         tables = [*study_tables(self.study), finals, entropies]
         if self.final.stage.compared != self.final.stage.conditions:
             lines.append(Text("Runs of a search selected its trials: the best is biased upwards."))
-        return Group(*lines, *(console_table(table) for table in tables if table.rows))
+        for table in tables:
+            if table.rows:
+                lines += [console_table(table), Text()]
+        return Group(*lines)
 
 
 def compare_stage(

@@ -89,12 +89,22 @@ def search_views(searches: Iterable[Mapping[str, Any]]) -> Iterator[RenderableTy
 
 
 def console_table(table: DataTable) -> Table:
-    """A table of the report for the console."""
-    left = [head for head, kind in table.heads if kind != "number"]
-    shown = new_table(table.title, [head for head, _ in table.heads], left)
-    for row in table.cells:
-        shown.add_row(*(cell.text for cell in row))
-    return shown
+    """A table of the report for the console.
+
+    A task or metric that is the same in all rows is in the title: 80 columns are few.
+    """
+    columns = [
+        (head, kind, [cells[i].text for cells in table.cells])
+        for i, (head, kind) in enumerate(table.heads)
+    ]
+    same = [c for c in columns if c[0] in ("Task", "Measure", "Metric") and len(set(c[2])) == 1]
+    shown = [c for c in columns if c not in same]
+    title = ": ".join(filter(None, (table.title, ", ".join(c[2][0] for c in same))))
+    left = [head for head, kind, _ in shown if kind != "number"]
+    new = new_table(title, [head for head, _, _ in shown], left)
+    for row in zip(*(texts for _, _, texts in shown), strict=True):
+        new.add_row(*row)
+    return new
 
 
 def measured(metric: str, value: float | None) -> str:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from music_rllib import names
 from music_rllib.report.figures.choice import study_drawings
@@ -19,6 +21,7 @@ from music_rllib.results.claims import Verdict
 from music_rllib.results.data import Points, RunRecord, Sweep, columns
 from music_rllib.results.study import Study, alpha_lines, study_of
 from music_rllib.results.tables import study_tables
+from music_rllib.sweep.views.results import console_table
 
 BUDGET = 10_000
 STEPS = np.arange(1000, BUDGET + 1, 1000)
@@ -261,6 +264,15 @@ def own_alphas(rng: np.random.Generator) -> list[tuple[RunRecord, Points]]:
         for q, alpha, height in (("1", "0.15", 0.3), ("1.5", "0.05", 0.33), ("2", "0.05", 0.3))
         for seed in range(6)
     ]
+
+
+def test_tables_fit_a_console_of_80_columns(rng: np.random.Generator) -> None:
+    for table in study_tables(study_of(sweep_of(own_alphas(rng), BEFORE))):
+        console = Console(width=80, file=io.StringIO(), record=True)
+        console.print(console_table(table))
+        printed = console.export_text()
+        words = {word for row in table.cells for cell in row for word in cell.text.split()}
+        assert all(word in printed for word in words)
 
 
 def test_a_planned_comparison_is_not_repeated_under_another_label(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import itertools
 import json
 import os
@@ -19,6 +20,7 @@ import pyarrow.fs as pafs
 import pytest
 import yaml
 from fsspec.implementations.memory import MemoryFileSystem  # type: ignore[import-untyped]
+from rich.console import Console
 
 from music_rllib import names
 from music_rllib.config.load import load_config
@@ -54,6 +56,7 @@ from music_rllib.sweep import clean, driver, driver_lock, execution
 from music_rllib.sweep.export import sweep_of_run
 from music_rllib.sweep.listeners.state_file import StateFile
 from music_rllib.sweep.preflight import import_checkpoints
+from music_rllib.sweep.views.results import console_table
 from tests.hostile_files import SPACES
 
 REPOSITORY = Path(__file__).parents[3]
@@ -218,8 +221,9 @@ def test_compare_and_the_report_say_the_same_of_the_same_sweep(
     finals, *_ = performance_tables(analyse(logged))
     # A seed that has finished on one of two tasks counts for that task only.
     assert [row[-1] for row in finals.rows] == [12, 8, 10, 6, 5, 5, 6, 5, 6]
-    for row in finals.cells:
-        assert in_one_line(" ".join(cell.text for cell in row)) in in_one_line(text)
+    console = Console(width=160, file=io.StringIO(), record=True)
+    console.print(console_table(finals))
+    assert in_one_line(console.export_text()) in in_one_line(text)
     document = program("compare", f"{storage}/mine", "--json").document
     study = study_of(logged)
     assert document["comparisons"] == json.loads(as_json(claim_rows(study)))
