@@ -11,7 +11,6 @@ from matplotlib.axes import Axes
 
 from docs.result_pages.figures import figure
 from docs.result_pages.summary import complete_studies
-from docs.result_pages.totals import steps_before
 from music_rllib import names
 from music_rllib.report.figures.choice import Drawing
 from music_rllib.report.figures.draw import files
@@ -19,7 +18,7 @@ from music_rllib.report.figures.plots import METRICS, Style, Subplot, curve_subp
 from music_rllib.results import statistics as st
 from music_rllib.results.analysis import Curve, curve
 from music_rllib.results.conditions import Condition, StageRuns, find_stages
-from music_rllib.results.data import Sweep
+from music_rllib.results.data import Sweep, with_pretraining
 from music_rllib.results.statistics import Array
 
 PRETRAINING = ("MUSIC-u (pretraining, no reward)", Style("#9a9a9a", "o"))
@@ -95,7 +94,11 @@ def _subplot(
 def _shifted(sweep: Sweep, found: Curve | None) -> Curve:
     """The curve shifted by the pretraining steps of its runs."""
     assert found is not None, "runs of a complete study have been evaluated"
-    return replace(found, steps=found.steps + steps_before(sweep, found.condition.runs[0]))
+    own, whole = (
+        one.least_budget(found.task, found.condition.runs)
+        for one in (sweep, with_pretraining(sweep))
+    )
+    return replace(found, steps=found.steps + whole - own)
 
 
 def _sampled(sweep: Sweep, condition: Condition, task: str) -> Curve | None:

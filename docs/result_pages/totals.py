@@ -13,9 +13,8 @@ from music_rllib.results.analysis_plan import MARGIN_OF_A_RATE
 from music_rllib.results.answer import numbers_in_words
 from music_rllib.results.claims import Claim, contrast, exploratory
 from music_rllib.results.conditions import Condition, find_stages
-from music_rllib.results.data import Sweep
+from music_rllib.results.data import Sweep, with_pretraining
 from music_rllib.results.scores import Measure, area_under_curve
-from music_rllib.results.statistics import Array
 
 
 @dataclass(frozen=True)
@@ -34,28 +33,6 @@ class AtEqualTotal:
         return self.claim.measure.horizon
 
 
-def source_of(sweep: Sweep, run: int) -> int | None:
-    """Position of the run that another one starts from; None for a run from scratch."""
-    key = sweep.runs[run].tags.get(names.TAG_SOURCE_NODE)
-    positions = (i for i, other in enumerate(sweep.runs) if key and other.node_key == key)
-    return next(positions, None)
-
-
-def steps_before(sweep: Sweep, run: int) -> int:
-    """Environment steps of the run's pretraining."""
-    source = source_of(sweep, run)
-    return 0 if source is None else sweep.runs[source].budget or 0
-
-
-def total_area(sweep: Sweep, run: int, metric: str, total: float) -> float:
-    """Mean of a metric over `total` steps, the first of which are the pretraining's."""
-    source, before = source_of(sweep, run), steps_before(sweep, run)
-    own = area_under_curve(*sweep.finite(run, metric), total - before) * (total - before)
-    if source is not None:
-        own += area_under_curve(*sweep.finite(source, metric), before) * before
-    return own / total
-
-
 def at_equal_total(
     sweep: Sweep, pretrained: Condition, scratch: Condition, task: str, metric: str
 ) -> AtEqualTotal | None:
@@ -68,37 +45,33 @@ def at_equal_total(
     if len(seeds) < 2:
         return None
     runs = [[side[seed] for seed in seeds] for side in sides]
-    budgets = (steps_before(sweep, i) + (sweep.runs[i].budget or 0) for side in runs for i in side)
-    total = float(min(budgets))
-    x, y = (np.array([total_area(sweep, i, metric, total) for i in side]) for side in runs)
+    own = sweep.least_budget(task, runs[0])
+    sweep = with_pretraining(sweep)
+    before = sweep.least_budget(task, runs[0]) - own
+    total = sweep.least_budget(task, [*runs[0], *runs[1]])
+    x, y = (
+        np.array([area_under_curve(*sweep.finite(i, metric), total) for i in side]) for side in runs
+    )
     claim = Claim(
         first=pretrained.label,
         second=scratch.label,
         task=task,
-        measure=Measure(kind="auc", metric=metric, horizon=total),
+        measure=Measure(kind="auc_total", metric=metric, horizon=total),
         margin=MARGIN_OF_A_RATE,
         contrast=contrast(x, y, paired=True, margin=MARGIN_OF_A_RATE),
         pairs=[(pretrained, scratch)],
     )
     (claim,) = exploratory([claim])
-    first = runs[0][0]
-    grid = sweep.finite(first, metric)[0] + steps_before(sweep, first)
-    grid = grid[grid <= total]
-    means = [_mean_at(sweep, side, metric, grid) for side in runs]
+    grid = sweep.finite(runs[0][0], metric)[0]
+    grid = grid[(grid >= before) & (grid <= total)]
+    means = [
+        np.mean([np.interp(grid, *sweep.finite(i, metric)) for i in side], axis=0) for side in runs
+    ]
     ahead = means[0] > means[1]
     crossing = None
     if ahead.any() and not ahead.all():
         crossing = int(grid[ahead.argmax()]), int(grid[~ahead][-1])
     return AtEqualTotal(claim, (float(means[0][-1]), float(means[1][-1])), crossing)
-
-
-def _mean_at(sweep: Sweep, runs: list[int], metric: str, totals: Array) -> Array:
-    """Mean of the runs' metric at total numbers of steps."""
-    curves = []
-    for run in runs:
-        steps, values = sweep.finite(run, metric)
-        curves.append(np.interp(totals, steps + steps_before(sweep, run), values))
-    return np.asarray(np.mean(curves, axis=0))
 
 
 def totals_table(sweep: Sweep, first: str, second: str) -> Iterator[str]:

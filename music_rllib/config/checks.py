@@ -200,11 +200,26 @@ def check_analysis(
                 metrics |= {task.primary_metric for task in stage.tasks}
                 if broken := _broken_rule(stage, condition) or _broken_final(stage, condition):
                     findings.add(path, broken)
+                if analysis.metric == "auc_total" and (unknown := _unknown_steps(stage, stages)):
+                    findings.add(("analysis", "metric"), unknown)
     if analysis.margin is None and names.EVAL_RETURN in metrics:
         findings.add(("analysis", "margin"), "must be given for tasks without success, got null")
     if (analysis.margin or 0) >= 1 and metrics == {names.EVAL_SUCCESS}:
         rule = f"must be < 1 for a success rate (5 % are 0.05), got {analysis.margin:g}"
         findings.add(("analysis", "margin"), rule)
+
+
+def _unknown_steps(stage: Stage, stages: Mapping[str, Stage | None]) -> str | None:
+    """The rule that a stage breaks whose pretraining's steps are unknown."""
+    source: Stage | None = stage
+    while source is not None and source.source is not None:
+        if source.source.checkpoint is not None:
+            return (
+                "must not be auc_total where pretraining is outside the sweep: "
+                f"{source.name!r} starts from a checkpoint"
+            )
+        source = stages.get(source.source.stage or "")
+    return None
 
 
 def _compared_runs(stage: Stage) -> list[Settings]:

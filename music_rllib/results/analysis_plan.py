@@ -33,6 +33,8 @@ MARGIN_OF_A_RATE = 0.05
 _PRIMARY = {
     "auc": "area under the learning curve of {metric}: its mean over the budget, by the trapezoid "
     "rule over environment steps",
+    "auc_total": "area under the learning curve of {metric}: its mean over the budget, pretraining "
+    "included, by the trapezoid rule over environment steps",
     "final": "{metric} of the last evaluation",
 }
 _TEST = (
@@ -57,7 +59,7 @@ class AnalysisPlan(_Strict):
     hypotheses: tuple[Line, ...] = Field(min_length=1, max_length=50, strict=False)
     stage: Line
     """Stage of the conditions, unless a hypothesis names another one."""
-    metric: Literal["auc", "final"]
+    metric: Literal["auc", "auc_total", "final"]
     primary_metric: Line
     """`metric` in words."""
     margin: float | None = Field(gt=0)
@@ -191,7 +193,7 @@ def analysis_plan(config: SweepConfig) -> AnalysisPlan | None:
         margin=margin,
         seeds=_of_each({stage.name: _seeds(stage, config.seeds) for stage in stages}),
         control=_of_each({stage.name: _control(stage) for stage in stages}),
-        budget=_budget(stages),
+        budget=_budget(stages, config if analysis.metric == "auc_total" else None),
         test=_TEST,
     )
 
@@ -232,16 +234,33 @@ def is_controlled(alpha: str) -> bool:
     return any(word in alpha for word in ("matched", "learned", "normalised"))
 
 
-def _budget(stages: Sequence[Stage]) -> dict[str, int]:
-    """Smallest budget of each task in any stage; in a search, of its runs on fresh seeds."""
+def _budget(stages: Sequence[Stage], pretrained_in: SweepConfig | None) -> dict[str, int]:
+    """Smallest budget of each task in any stage; in a search, of its runs on fresh seeds.
+
+    Args:
+        stages: The stages.
+        pretrained_in: The sweep whose pretraining stages count; None: pretraining does not count.
+    """
     budget: dict[str, int] = {}
     for stage in stages:
         final = stage.search.final if stage.search else None
         for point in stage.points:
             for task, run in point.runs.items():
                 steps = (final.env_steps if final else None) or run.env_steps
+                if pretrained_in is not None:
+                    steps += _steps_before(pretrained_in, stage, task)
                 budget[task] = min(budget.get(task, steps), steps)
     return budget
+
+
+def _steps_before(config: SweepConfig, stage: Stage, task: str) -> int:
+    """Environment steps of the pretraining of a stage's runs on a task."""
+    if stage.source is None or stage.source.stage is None:
+        return 0
+    source = config.stage(stage.source.stage)
+    own = stage.source.task.name if stage.source.task else task
+    steps = min(point.runs[own].env_steps for point in source.points)
+    return steps + _steps_before(config, source, own)
 
 
 PLANS_TO_READ = "analysis_plan.md"

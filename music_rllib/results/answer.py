@@ -147,7 +147,7 @@ def numbers_in_words(claim: Claim) -> str:
 
 def _metric(study: Study, shown: Sequence[Claim]) -> str:
     measure = (shown[0] if shown else study.means[0]).measure
-    area = " (area under the learning curve)" if measure.kind == "auc" else ""
+    area = " (area under the learning curve)" if measure.kind != "final" else ""
     text = f"Metric: {measure.words}{area}"
     # A margin of success rates is none of returns.
     margins = {one.margin for one in _alike(shown) if one.margin is not None}

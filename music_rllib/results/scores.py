@@ -25,8 +25,8 @@ class Measure:
     """The number by which a run is compared."""
 
     kind: str
-    """`auc`: the mean of `metric` over the budget, the area under its curve. `final`: its last
-    value."""
+    """`auc`: the mean of `metric` over the budget, the area under its curve. `auc_total`: the same
+    with the steps of pretraining (`data.with_pretraining`). `final`: its last value."""
     metric: str
     horizon: float
     """Environment steps of the area: the smallest budget of the compared runs. NaN for several
@@ -52,7 +52,7 @@ class Measure:
         if self.kind == "final":
             return f"final {word}"
         budget = "the budget" if np.isnan(self.horizon) else f"{self.horizon:,.0f} steps"
-        return f"mean {word} over {budget}"
+        return f"mean {word} over {budget}" + ", pretraining included" * (self.kind == "auc_total")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +97,7 @@ def measure_on(
         sweep: The runs.
         task: The task.
         runs: Positions of all runs that are compared.
-        kind: `auc` or `final`.
+        kind: `auc`, `auc_total` or `final`.
         metric: The metric; None: the task's primary one.
         maximised: Whether higher values are better.
         horizon: Largest number of environment steps.
@@ -140,7 +140,7 @@ def _score(sweep: Sweep, run: int, measure: Measure) -> float:
     if not sweep.runs[run].is_finished or _has_failed(sweep, run, measure.metric):
         return np.nan
     steps, values = sweep.finite(run, measure.metric)
-    if measure.kind == "auc" and measure.horizon > 0:
+    if measure.kind != "final" and measure.horizon > 0:
         return area_under_curve(steps, values, measure.horizon)
     return float(values[-1]) if len(values) else np.nan
 
@@ -168,7 +168,7 @@ def scores_of(sweep: Sweep, condition: Condition, task: str, measure: Measure) -
             continue
         by_seed[record.seed] = score
         steps, values = sweep.finite(run, measure.metric)
-        whole = measure.kind == "auc" and measure.horizon > 0
+        whole = measure.kind != "final" and measure.horizon > 0
         used = values[steps <= measure.horizon] if whole else values[-1:]
         of_one = sweep.final(run, names.EVAL_EPISODES)
         if of_one is None:

@@ -281,6 +281,20 @@ def test_a_group_of_the_grid_gives_each_q_its_alpha(
         load(document)
 
 
+def test_auc_total_counts_the_steps_of_the_stages_before(load: Callable[..., SweepConfig]) -> None:
+    document = asking("q = 1.5 better than q = 1", stage="finetune")
+    budgets = {}
+    for metric in ("auc", "auc_total"):
+        document["analysis"]["metric"] = metric
+        plan = analysis_plan(config := load(document))
+        assert plan is not None
+        budgets[metric] = plan.budget
+    (before,) = config.stages[0].points
+    assert budgets["auc_total"] == {
+        task: steps + before.runs[task].env_steps for task, steps in budgets["auc"].items()
+    }
+
+
 def test_a_storage_can_name_environment_variables(
     load: Callable[..., SweepConfig], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -654,6 +668,12 @@ def test_an_imported_handoff_is_checked_before_the_start(
     (line,) = problems(from_checkpoint(slide))
     assert "must be of task FetchPush, got one of FetchSlide" in line
     load(from_checkpoint(slide, task="FetchSlide"))
+
+    asked = {"hypotheses": ["q = 1 against q = 2"], "metric": "auc_total"}
+    assert any(
+        "analysis.metric must not be auc_total where pretraining is outside the sweep" in line
+        for line in problems(from_checkpoint(push) | {"analysis": asked})
+    )
 
     (line,) = problems(from_checkpoint(checkpoint(tmp_path / "small", hidden_size=64)))
     assert "needs the same music.hidden_size" in line

@@ -527,3 +527,29 @@ def test_a_margin_of_success_is_not_named_beside_a_return(rng: np.random.Generat
     assert "Metric: mean return" in said
     assert "margin" not in said
     assert "standard deviation" not in said
+
+
+def test_auc_total_counts_the_steps_of_pretraining(rng: np.random.Generator) -> None:
+    """Two runs from scratch and from pretraining with equal curves of their own."""
+    runs, q = [], {"tac.entropic_index": "1"}
+    for seed in range(5):
+        source = {names.TAG_NODE_KEY: f"u{seed}"}
+        runs += [
+            run(q, seed, 0.1, rng, stage="pretrain", **source),
+            run(q, seed, 0.4, rng, stage="music-r", **{names.TAG_SOURCE_NODE: f"u{seed}"}),
+        ]
+        record, points = run(q, seed, 0.4, rng, stage="her")
+        longer = {**record.params, "env_steps": str(2 * BUDGET)}
+        steps = [2 * step for step in points.steps]
+        runs.append((replace(record, params=longer), points._replace(steps=steps)))
+    text = "stage = music-r against stage = her"
+    claims = {}
+    for metric, total in (("auc", BUDGET), ("auc_total", 2 * BUDGET)):
+        planned = plan(text, metric=metric, stage="music-r", budget={"FetchPush": total})
+        (claims[metric],) = study_of(sweep_of(runs, with_plan((), planned, 5))).planned
+    # Over 10,000 steps of each: a mean of 0.4 against the first half of the slower rise.
+    assert float(claims["auc"].contrast.difference.value) == pytest.approx(0.2, abs=0.03)
+    # Over 20,000: the mean of 0.1 and 0.4 against 0.4.
+    whole = claims["auc_total"]
+    assert float(whole.contrast.difference.value) == pytest.approx(-0.15, abs=0.03)
+    assert whole.measure.words == "mean success over 20,000 steps, pretraining included"
