@@ -220,9 +220,10 @@ def test_the_schema_accepts_shipped_sweeps_and_rejects_unknown_names(
     assert all("description" in field for field in described.values())
 
 
-def test_it_runs_as_a_module_from_any_folder(tmp_path: Path) -> None:
+@pytest.mark.parametrize("program", ["music_rllib plan", "music_rllib.sweep"])
+def test_it_runs_as_a_module_from_any_folder(program: str, tmp_path: Path) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "music_rllib", "plan", "tac.alpha=-1"],
+        [sys.executable, "-m", *program.split(), "tac.alpha=-1"],
         cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
         capture_output=True,
