@@ -19,9 +19,9 @@ from music_rllib.command_line import called_as
 from music_rllib.errors import FAILED, BadInputError
 
 if TYPE_CHECKING:
+    from music_rllib.experiment.open_sweep import OpenSweep
     from music_rllib.report.page import SweepReport
     from music_rllib.results.data import RunRecord, Sweep
-    from music_rllib.results.read import SweepRead
 
 EXAMPLES = """\
 Examples:
@@ -185,9 +185,12 @@ def _report(
     from music_rllib.report.figures.choice import slug
     from music_rllib.report.two_sweeps import joined_sweeps
     from music_rllib.results.answer import answer
+    from music_rllib.results.data import ReportError
     from music_rllib.results.read import read_sweep
 
     first, *others = (read_sweep(place, storage, metrics=WANTED, lenient=True) for place in places)
+    if attach and first.opened is None:
+        raise ReportError("--attach must be given with a sweep in its storage, got an exported one")
     sweep, both, name = first.sweep, None, "report"
     for other in others:
         both = (first.sweep, other.sweep)
@@ -211,8 +214,8 @@ def _report(
     picture = page.parent / "figures" / f"{PICTURE}.png"
     if picture.exists():
         typer.echo(f"Picture: {picture.absolute()}")
-    if attach:
-        _attach(first, page.parent, made)
+    if attach and first.opened is not None:
+        _attach(first.sweep, first.opened, page.parent, made)
     if damaged:
         typer.echo(f"error: {redact(damaged)}", err=True)
         return FAILED
@@ -250,17 +253,14 @@ def _serve(place: str, storage: str | None, port: int) -> None:
     serve(make_server(page, port), page, typer.echo)
 
 
-def _attach(source: SweepRead, folder: Path, made: SweepReport) -> None:
+def _attach(sweep: Sweep, opened: OpenSweep, folder: Path, made: SweepReport) -> None:
     """Store the report, in `folder`, with the sweep's run in MLflow."""
     from music_rllib.report.build import made_files
     from music_rllib.results.answer import answer
-    from music_rllib.results.data import ReportError
     from music_rllib.tracking.tracker import SweepRun
 
-    if source.opened is None:
-        raise ReportError("--attach must be given with a sweep in its storage, got an exported one")
-    run = SweepRun.of(source.opened)
-    note = _note(answer(source.sweep, made.study)[1], made, run.run_id)
+    run = SweepRun.of(opened)
+    note = _note(answer(sweep, made.study)[1], made, run.run_id)
     run.attach(folder, made_files(folder), "report", note)
     typer.echo(f"Attached to the sweep's run in MLflow: {run.page}")
 
