@@ -38,14 +38,11 @@ def transition_bounds(
     return estimator.transition_bounds(frames[:, 0], frames[:, 1], (swapped,))
 
 
-@pytest.mark.parametrize("rho, dims", [(0.9, 1), (0.5, 3)])
-def test_bound_approaches_what_the_cap_allows_and_never_exceeds_the_truth(
-    rho: float, dims: int
-) -> None:
-    truth = true_information(rho, dims)
-    bound = trained_bound(rho, dims, seed=0)
+def test_bound_approaches_what_the_cap_allows_and_never_exceeds_the_truth() -> None:
+    truth = true_information(0.9, 1)
+    bound = trained_bound(0.9, 1, seed=0, steps=200)
     # 0.01: the sampling error of 160,000 held-out pairs, three standard deviations.
-    assert 0.9 * capped_optimum(rho, dims) < bound < min(truth, 2.0) + 0.01
+    assert 0.9 * capped_optimum(0.9, 1) < bound < min(truth, 2.0) + 0.01
 
 
 @pytest.mark.parametrize("bound", ["moving_average", "nwj", "smile", "infonce"])
