@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -15,7 +16,7 @@ from music_rllib.experiment.record import keep_record
 __all__ = ["kept_sweep"]
 
 
-def kept_sweep(storage: Path, tracking_uri: str | None = None) -> Path:
+def kept_sweep(storage: Path, tracking_uri: str | None = None, **settings: Any) -> Path:
     """The folder of a sweep `s` that was tracked, its record there but for passwords."""
     file = storage / "s.yaml"
     stages = [{"name": "train", "variant": "tac"}]
@@ -25,6 +26,7 @@ def kept_sweep(storage: Path, tracking_uri: str | None = None) -> Path:
         "seeds": 3,
         "stages": stages,
         "storage": "elsewhere",
+        **settings,
     }
     file.write_text(yaml.safe_dump(document))
     config = load_config(file)

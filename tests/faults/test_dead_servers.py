@@ -13,13 +13,12 @@ import requests
 from tests.faults import comparison, sweeps
 from tests.faults.sweeps import resume
 from tests.integration.conftest import Program
-from tests.integration.mlflow_server import USER, MlflowServer
+from tests.integration.mlflow_server import USER, MlflowServer, server_script
 from tests.integration.tracking.test_refusing_mlflow import TODO, refusing
-from tests.integration.tracking.test_secrets import PASSWORD, mlflow_server
-
-__all__ = ["mlflow_server"]
 
 pytestmark = pytest.mark.thorough
+
+PASSWORD = "planted-mlflow-password"
 
 
 @pytest.fixture
@@ -87,6 +86,13 @@ def test_a_server_that_answers_500(program: Program, unbroken: Path, server: Mlf
     server.wait()
     resume(program)
     same(unbroken, program, server.uri)
+
+
+@pytest.fixture
+def mlflow_server(tmp_path: Path) -> Iterator[str]:
+    """`cluster/mlflow-server.sh` on loopback, with sqlite; its URI."""
+    with server_script(tmp_path / "server", PASSWORD) as uri:
+        yield uri
 
 
 def test_a_password_that_is_changed(

@@ -170,11 +170,11 @@ def program_environment() -> dict[str, str]:
     return os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (REPOSITORY, ENVIRONMENTS)))}
 
 
-def mlflow_runs_of(folder: Path) -> dict[str, Any]:
-    """All runs in the embedded MLflow of a sweep in `folder`, by name."""
+def mlflow_runs_of(folder: Path, database: str = "results/mlflow.db") -> dict[str, Any]:
+    """All runs in MLflow's database of a sweep in `folder`, by name."""
     from mlflow import MlflowClient
 
-    client = MlflowClient(f"sqlite:///{folder}/results/mlflow.db")
+    client = MlflowClient(f"sqlite:///{folder}/{database}")
     (experiment,) = [e for e in client.search_experiments() if e.name == "points"]
     found = client.search_runs([experiment.experiment_id])
     by_name = {run.info.run_name: run for run in found}

@@ -22,6 +22,7 @@ from music_rllib.redaction import (
     redact,
     without_secrets,
 )
+from tests.kept_sweep import kept_sweep
 
 
 @pytest.mark.parametrize(
@@ -198,3 +199,11 @@ def test_redaction_takes_linear_time(text: str) -> None:
     began = time.process_time()
     redact(text)
     assert time.process_time() - began < 1
+
+
+def test_a_password_in_the_tracking_uri_is_not_kept(tmp_path: Path) -> None:
+    """It should be in the environment; where it is not, the copy of the file leaves it out."""
+    kept_sweep(tmp_path, mlflow={"tracking_uri": "http://music:planted-in-a-uri@localhost:1"})
+    kept = [path for path in (tmp_path / "s").rglob("*") if path.is_file()]
+    assert not [path for path in kept if b"planted" in path.read_bytes()]
+    assert "http://localhost:1" in (tmp_path / "s" / "config.json").read_text()

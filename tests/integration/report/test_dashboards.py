@@ -1,12 +1,10 @@
-"""The dashboards, with a sweep that Prometheus scrapes."""
+"""The dashboards; test_sweep_local.py has a sweep that Prometheus scrapes."""
 
 from __future__ import annotations
 
 import json
 import re
-import signal
 import subprocess
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -21,7 +19,7 @@ from music_rllib.sweep.listeners.prometheus import GAUGES, TARGETS
 from tests.ports import free_port
 
 DASHBOARDS = Path(__file__).parents[3] / "dashboards"
-PATIENCE = 240.0
+DASHBOARD_SECONDS = 240.0
 
 
 def dashboard() -> dict[str, Any]:
@@ -81,14 +79,14 @@ def test_the_provisioning_is_consistent() -> None:
 class Prometheus:
     """A server that scrapes the sweep with the repository's configuration."""
 
-    def __init__(self, program: Path, folder: Path) -> None:
+    def __init__(self, program: Path, folder: Path, sweeps: Path) -> None:
         self.address = f"127.0.0.1:{free_port()}"
         text = (DASHBOARDS / "prometheus.yml").read_text()
         config = yaml.safe_load(text)
         (job,) = config["scrape_configs"]
         (discovery,) = job["file_sd_configs"]
         assert f"../results/{TARGETS}/*.json" in discovery["files"]
-        discovery["files"] = [str(folder / "results" / TARGETS / "*.json")]
+        discovery["files"] = [str(sweeps / "results" / TARGETS / "*.json")]
         config["global"]["scrape_interval"] = discovery["refresh_interval"] = "1s"
         (folder / "prometheus.yml").write_text(yaml.safe_dump(config))
         self.log = folder / "prometheus.log"
@@ -116,47 +114,17 @@ class Prometheus:
 
 
 @pytest.fixture
-def prometheus(require_service: Callable[[str], Path], tmp_path: Path) -> Iterator[Prometheus]:
-    server = Prometheus(require_service("prometheus"), tmp_path)
-    yield server
-    server.process.terminate()
-    server.process.wait(30)
+def prometheus(
+    require_service: Callable[[str], Path], tmp_path: Path
+) -> Iterator[Callable[[Path], Prometheus]]:
+    """Start a server for the sweeps in a folder."""
+    program, servers = require_service("prometheus"), []
 
+    def start(sweeps: Path) -> Prometheus:
+        servers.append(Prometheus(program, tmp_path, sweeps))
+        return servers[-1]
 
-def test_every_query_returns_data_of_a_running_sweep(
-    prometheus: Prometheus, sweep_program: Any, sweep_document: dict[str, Any]
-) -> None:
-    sweep_document["name"] = "watched"
-    # The sweep is stopped when every query has returned data.
-    sweep_document["stages"] = sweep_document["stages"][:1]
-    sweep_document["defaults"]["env_steps"] = 2_000_000
-    sweep_program.write(sweep_document)
-    process = sweep_program.start()
-    waiting = queries()
-    seen: dict[str, list[dict[str, Any]]] = {}
-    deadline = time.monotonic() + PATIENCE
-    try:
-        while waiting and time.monotonic() < deadline and process.poll() is None:
-            for name, query in list(waiting.items()):
-                if found := prometheus.ask(query):
-                    seen[name] = found
-                    del waiting[name]
-            time.sleep(0.5)
-        ended = process.poll()
-        labels = {label for metric, label in variables() if prometheus.ask(f"{metric}")}
-    finally:
-        process.terminate()
-        output, errors = process.communicate(timeout=120)
-    assert ended is None, f"the sweep must not end early:\n{output}{errors}"
-    assert process.returncode == 128 + signal.SIGTERM
-    assert "continue with: python -m music_rllib.sweep run sweep.yaml" in output
-    assert not waiting, f"no data for {list(waiting)}"
-    assert labels == {"sweep", "task", "q"}
-    (success,) = seen["Success rate by q and task A"]
-    assert success["metric"] == {"q": "1", "stage": "pretrain", "task": "Point"}
-    assert 0 <= float(success["value"][1]) <= 1
-    targets = sweep_program.folder / "results" / TARGETS
-    assert not list(targets.iterdir()), "a sweep that has ended is not scraped"
-    states = {one["metric"]["state"]: one["value"][1] for one in seen["Runs by state A"]}
-    assert states["started"] == "1"
-    assert seen["Failed runs A"][0]["value"][1] == "0"
+    yield start
+    for server in servers:
+        server.process.terminate()
+        server.process.wait(30)

@@ -7,15 +7,20 @@ import json
 import re
 import shutil
 import signal
-from collections.abc import Callable
+import stat
+import subprocess
+import time
+from collections.abc import Callable, Iterator
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+import requests
 
 from music_rllib import names
 from music_rllib.program import main
+from music_rllib.sweep.listeners.prometheus import TARGETS
 from tests.integration.conftest import (
     ENVIRONMENTS,
     POINT,
@@ -23,45 +28,62 @@ from tests.integration.conftest import (
     SWEEP,
     Program,
     call,
+    end,
     listening,
     metric_steps,
     mlflow_runs_of,
     program_environment,
     rows,
 )
+from tests.integration.mlflow_server import USER, server_script
+from tests.integration.report.test_dashboards import (
+    DASHBOARD_SECONDS,
+    Prometheus,
+    prometheus,
+    queries,
+    variables,
+)
+
+__all__ = ["prometheus"]
 
 pytestmark = pytest.mark.integration
 
-Document = dict[str, Any]
-Runs = Callable[[], dict[str, Any]]
+
+PASSWORD = "planted-mlflow-password"
+PLANTED = {
+    "MLFLOW_TRACKING_USERNAME": USER,
+    "MLFLOW_TRACKING_PASSWORD": PASSWORD,
+    "AWS_SECRET_ACCESS_KEY": "planted-aws-key",
+    "MUSIC_RLLIB_SERVE_TOKEN": "planted-serve-token",
+    "RAY_AUTH_TOKEN": "planted-ray-token-" + "0" * 32,
+    "RAY_AUTH_MODE": "token",
+}
 
 
 class Ended(NamedTuple):
-    """A sweep that has ended, and what it said."""
+    """A sweep that has ended, and what it printed."""
 
     folder: Path
+    server: str
     code: int
     output: str
     errors: str
 
+    def runs(self) -> dict[str, Any]:
+        """All runs in MLflow by name."""
+        return mlflow_runs_of(self.folder, "server/runs.db")
+
 
 @pytest.fixture(scope="module")
-def ended(tmp_path_factory: pytest.TempPathFactory) -> Ended:
+def ended(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ended]:
     """A sweep on two tasks without success, one of which fails in its 300th step.
 
     Their module lies beside the file, in another folder than the current one, as do some with the
-    names of Python's own.
+    names of Python's own. MLflow is a server with a password.
     """
-    point = POINT | {"success_key": None}
-    document = SWEEP | {
-        "tasks": ["Broken", "Point"],
-        "environments": {"Broken": point | {"env_kwargs": {"fail_at": 300}}, "Point": point},
-        "defaults": SWEEP["defaults"] | {"env_steps": 800},
-    }
     folder = tmp_path_factory.mktemp("ended")
     program = Program(folder, program_environment(), "lab/sweep.yaml")
     (folder / "lab").mkdir()
-    program.write(document)
     shutil.copy(ENVIRONMENTS / "point_env.py", folder / "lab")
     for name in ("random", "types", "queue", "secrets"):
         (folder / "lab" / f"{name}.py").write_text("raise RuntimeError('not this one')")
@@ -72,7 +94,17 @@ def ended(tmp_path_factory: pytest.TempPathFactory) -> Ended:
         "look at postgresql://me:planted-1@db/screws "
         "(password=planted-2, 'token': 'planted-3') \x1b[2J"
     )
-    return Ended(program.folder, *program.run())
+    point = POINT | {"success_key": None}
+    with server_script(folder / "server", PASSWORD) as server:
+        document = SWEEP | {
+            "tasks": ["Broken", "Point"],
+            "environments": {"Broken": point | {"env_kwargs": {"fail_at": 300}}, "Point": point},
+            "defaults": SWEEP["defaults"] | {"env_steps": 800},
+            "mlflow": {"tracking_uri": server},
+        }
+        program.write(document)
+        program.environment |= PLANTED
+        yield Ended(folder, server, *program.run())
 
 
 def test_a_failure_is_explained_and_the_others_finish(ended: Ended) -> None:
@@ -90,15 +122,28 @@ def test_a_failure_is_explained_and_the_others_finish(ended: Ended) -> None:
     text = log.read_text()
     assert 'raise RuntimeError(f"the gripper fell off' in text
     assert "point_env.py" in text
-    runs = mlflow_runs_of(ended.folder)
+    runs = ended.runs()
     failed = runs["seed 0 Broken pretrain"]
     assert failed.info.status == "FAILED"
     assert failed.data.tags[names.TAG_FAILURE].startswith("RuntimeError: the gripper fell off")
     assert not [name for name in runs if "Broken finetune" in name]
-    # What the environment said holds passwords: they are in no byte of what is kept and shown.
-    files = [file for file in ended.folder.rglob("*") if file.is_file()]
-    assert [file for file in files if b"planted-" in file.read_bytes()] == []
-    assert "planted-" not in output
+
+
+def test_secrets_are_used_and_written_nowhere(ended: Ended) -> None:
+    """Passwords in variables and in what an environment said."""
+    url = f"{ended.server}/api/2.0/mlflow/runs/search"
+    wanted: Any = {"experiment_ids": ["1"], "max_results": 50}
+    assert requests.post(url, json=wanted, timeout=60).status_code == 401
+    found = requests.post(url, json=wanted, auth=(USER, PASSWORD), timeout=60)
+    assert len(found.json()["runs"]) == 5, "the sweep's run and those that started"
+    for shown in (ended.output, found.text):
+        assert "planted-" not in shown
+    # The storage, the server's database, artifacts and log.
+    (settings,) = ended.folder.rglob("basic_auth.ini")  # the one place where MLflow takes it from
+    assert stat.S_IMODE(settings.stat().st_mode) == 0o600
+    files = [path for path in ended.folder.rglob("*") if path.is_file()]
+    assert [path for path in files if b"planted-" in path.read_bytes()] == [settings]
+    assert settings.read_text().count("planted-") == 1
 
 
 def test_tasks_without_success_show_their_return_from_the_first_line_to_the_report(
@@ -109,7 +154,7 @@ def test_tasks_without_success_show_their_return_from_the_first_line_to_the_repo
     assert re.search(r"finished, return -\d", output)
     assert "success" not in output.replace(str(folder), "")
     assert all(float(row[1]) < 0 for row in rows(output) if row[-1] == "finished")
-    for run in mlflow_runs_of(folder).values():
+    for run in ended.runs().values():
         assert names.EVAL_SUCCESS not in run.data.metrics
     report = folder / "results" / "points" / "report"
     page = (report / "report.html").read_text()
@@ -127,34 +172,74 @@ def test_tasks_without_success_show_their_return_from_the_first_line_to_the_repo
         assert words in said
 
 
-def test_two_drivers_of_one_sweep_stopped_killed_and_continued(
-    sweep_program: Any,
-    sweep_document: Document,
-    mlflow_runs: Runs,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.syspath_prepend(ENVIRONMENTS)
-    fast = tmp_path / "fast"
-    sweep_document["environments"]["Point"] |= {
-        "env_id": "point_env:Paced-v0",
-        # It does not end before the other driver has begun.
-        "env_kwargs": {"fast": str(fast), "after": 140, "seconds": 0.2},
-    }
-    sweep_document["defaults"] |= {
+class Paced(NamedTuple):
+    """A driver whose runs are slow until the file `fast` exists."""
+
+    program: Program
+    fast: Path
+    driver: subprocess.Popen[str]
+
+
+@pytest.fixture(scope="module")
+def paced(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Paced]:
+    """A sweep of two runs, one at a time, at its 200th of 2,000 steps."""
+    folder = tmp_path_factory.mktemp("paced")
+    fast = folder / "fast"
+    # It does not end before the other driver has begun.
+    kwargs = {"fast": str(fast), "after": 140, "seconds": 0.2}
+    slow = POINT | {"env_id": "point_env:Paced-v0", "env_kwargs": kwargs}
+    defaults = SWEEP["defaults"] | {
         "env_steps": 2000,
         "evaluation": {"interval": 200, "episodes": 2},
+        "tac": SWEEP["defaults"]["tac"] | {"random_steps": 100},
     }
-    sweep_document["stages"] = sweep_document["stages"][:1]
-    sweep_document |= {"seeds": [0, 1], "resources": {"num_cpus": 1}}
-    sweep_program.write(sweep_document)
+    program = Program(folder, program_environment())
+    program.write(
+        SWEEP
+        | {"stages": SWEEP["stages"][:1], "seeds": [0, 1], "resources": {"num_cpus": 1}}
+        | {"environments": {"Point": slow}, "defaults": defaults}
+    )
+    driver = program.start_until(" 200 of 2,000 env steps")
+    yield Paced(program, fast, driver)
+    end(driver)
 
-    one = sweep_program.start_until(" 200 of 2,000 env steps")
+
+def test_every_query_of_the_dashboard_returns_data_of_a_running_sweep(
+    paced: Paced, prometheus: Callable[[Path], Prometheus]
+) -> None:
+    server = prometheus(paced.program.folder)
+    waiting = queries()
+    seen: dict[str, list[dict[str, Any]]] = {}
+    deadline = time.monotonic() + DASHBOARD_SECONDS
+    while waiting and time.monotonic() < deadline and paced.driver.poll() is None:
+        for name, query in list(waiting.items()):
+            if found := server.ask(query):
+                seen[name] = found
+                del waiting[name]
+        time.sleep(0.5)
+    assert not waiting, f"no data for {list(waiting)}"
+    assert {label for metric, label in variables() if server.ask(metric)} == {"sweep", "task", "q"}
+    (success,) = seen["Success rate by q and task A"]
+    assert success["metric"] == {"q": "1", "stage": "pretrain", "task": "Point"}
+    assert 0 <= float(success["value"][1]) <= 1
+    states = {one["metric"]["state"]: float(one["value"][1]) for one in seen["Runs by state A"]}
+    assert states["started"] > 0
+    assert sum(states.values()) == 2
+    assert seen["Failed runs A"][0]["value"][1] == "0"
+
+
+def test_two_drivers_of_one_sweep_stopped_killed_and_continued(
+    paced: Paced, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(ENVIRONMENTS)
+    program, fast, one = paced
+    folder = program.folder
+    results = folder / "results"
     places = listening(one)
     assert "raylet" in set.union(*places.values())
     assert all(ip_address(place.removeprefix("::ffff:")).is_loopback for place in places), places
-    other = sweep_program.start_until("seed1: 200 of 2,000 env steps")
-    code, _, errors = call(main, tmp_path, "run", "sweep.yaml", "--retrain", "seed0")
+    other = program.start_until("seed1: 200 of 2,000 env steps")
+    code, _, errors = call(main, folder, "run", "sweep.yaml", "--retrain", "seed0")
     assert code == 2
     assert "given while no other process runs points, got sweep 'points' (process" in errors
     one.send_signal(signal.SIGINT)
@@ -165,8 +250,8 @@ def test_two_drivers_of_one_sweep_stopped_killed_and_continued(
     other.kill()
     other.communicate()
 
-    one = sweep_program.start_until("seed0: continues at ")
-    other = sweep_program.start_until("seed1: continues at ")
+    one = program.start_until("seed0: continues at ")
+    other = program.start_until("seed1: continues at ")
     fast.touch()
     for process in (one, other):
         output, errors = process.communicate(timeout=240)
@@ -174,9 +259,11 @@ def test_two_drivers_of_one_sweep_stopped_killed_and_continued(
         assert [row[-1] for row in rows(output)] == ["finished", "finished"]
     evaluated = list(range(0, 2001, 200))
     for seed in (0, 1):
-        assert metric_steps(tmp_path, mlflow_runs()[f"seed {seed} Point pretrain"]) == evaluated
-    assert list((tmp_path / "results" / "work").iterdir()) == []
-    for node in (tmp_path / "results" / "nodes").iterdir():
+        run = mlflow_runs_of(folder)[f"seed {seed} Point pretrain"]
+        assert metric_steps(folder, run) == evaluated
+    assert list((results / "work").iterdir()) == []
+    assert not list((results / TARGETS).iterdir()), "a sweep that has ended is not scraped"
+    for node in (results / "nodes").iterdir():
         history = [json.loads(line) for line in (node / "history.jsonl").read_text().splitlines()]
         assert [report["env_steps"] for report in history] == evaluated
         seconds = [report["seconds"] for report in history]
