@@ -74,13 +74,10 @@ LONG = (
     "integration/project/test_first_hour.py",
     "integration/algorithm/test_learning.py",
     "integration/report/test_report_in_browser.py",
-    "integration/tracking/test_secrets.py",
     "integration/project/test_docs_site.py",
-    "integration/report/test_dashboards.py",
     "faults/test_damage.py",
     "integration/serve/test_serve.py",
     "integration/sweep/test_longer_training.py",
-    "integration/sweep/test_screen.py",
 )
 """Files that take longest, the longest first: begun last, one would keep a single worker busy."""
 

@@ -66,6 +66,7 @@ EXPECTED = re.compile(
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     """Two values of q after a MUSIC-u stage, with the report at the end."""
     folder = tmp_path_factory.mktemp("sweep")
+    (folder / "home").mkdir()
     (folder / "sweep.yaml").write_text(yaml.safe_dump(SWEEP))
     output = _run(folder, report="on")
     client = MlflowClient(f"sqlite:///{folder}/results/mlflow.db")
@@ -76,11 +77,14 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
 
 def _run(folder: Path, report: str) -> str:
     """What a user's sweep says that ends well."""
+    # A screen wide enough for the last columns of tables, and a user without settings of Ray.
+    user = {names.VARIABLE_REPORT: report, "COLUMNS": "160", "HOME": str(folder / "home")}
+    environment = program_environment() | user
+    del environment["RAY_AUTH_MODE"]
     done = subprocess.run(
         [sys.executable, "-m", "music_rllib.sweep", "sweep.yaml"],
         cwd=folder,
-        # A screen wide enough for the last columns of tables.
-        env=program_environment() | {names.VARIABLE_REPORT: report, "COLUMNS": "160"},
+        env=environment,
         capture_output=True,
         text=True,
         check=False,
@@ -102,6 +106,8 @@ def test_the_screen_shows_the_plan_the_runs_and_their_results(finished: Finished
     assert {row[-1] for row in found} == {"finished"}
     assert all("1,200" in row for row in found)
     assert "mlflow ui --backend-store-uri" in output
+    # Ray by itself would have written a token file that changes later `ray start`s.
+    assert not (finished.folder / "home" / ".ray").exists()
 
 
 def test_mlflow_has_each_run_with_what_it_was_and_came_from(finished: Finished) -> None:
