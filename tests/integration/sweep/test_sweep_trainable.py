@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-import os
 import re
 import shutil
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -372,37 +370,18 @@ def test_runs_side_by_side_are_measured(monkeypatch: pytest.MonkeyPatch) -> None
     assert 5 * 2**20 < sample.memory < 2 * 2**30
 
 
-ALONE = """
-import sys
-from pathlib import Path
-from music_rllib.training.job import NodeJob
-from music_rllib.training.worker import RunTrainable
-from music_rllib.runtime.quiet import prepare_environment
-prepare_environment()
-trial = RunTrainable(config={"job": Path(sys.argv[1]).read_text()})
-while not trial.train()["done"]:
-    pass
-"""
-
-
-@pytest.mark.usefixtures("local_ray")
-def test_a_run_in_a_reused_process_has_the_same_numbers(tmp_path: Path) -> None:
-    """The process has trained another run and failed once; the reference is a new process."""
-    storage, reference = tmp_path / "reused", tmp_path / "new"
-    first = job(
-        storage, settings("music-u", seed=4, tac={"hidden_sizes": [8], "random_steps": 100})
-    )
-    bad = job(storage, settings("tac", task=POINT.model_copy(update={"env_id": "point_env:No-v0"})))
-    second = job(storage, settings("music-u"))
-    trial = RunTrainable(config=first.to_tune())
-    for node in (first, bad, second):
+def test_a_run_in_a_reused_process_has_the_same_numbers(
+    pretrained: NodeJob, tmp_path: Path
+) -> None:
+    """The process has trained another run and failed once."""
+    small = settings("music-u", seed=4, tac={"hidden_sizes": [8], "random_steps": 100})
+    bad = settings("tac", task=POINT.model_copy(update={"env_id": "point_env:No-v0"}))
+    last = job(tmp_path, settings("music-u"))
+    trial = RunTrainable(config=job(tmp_path, small).to_tune())
+    for node in (job(tmp_path, small), job(tmp_path, bad), last):
         assert trial.reset(node.to_tune())
         while not (result := trial.train())["done"]:
             pass
     trial.stop()
     assert CAUSE not in result
-    file = tmp_path / "job.json"
-    file.write_text(job(reference, settings("music-u")).model_dump_json())
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ENVIRONMENTS)])}
-    subprocess.run([sys.executable, "-c", ALONE, str(file)], env=environment, check=True)
-    assert numbers(storage, second) == numbers(reference, second)
+    assert numbers(tmp_path, last) == numbers(Path(pretrained.storage), pretrained)
