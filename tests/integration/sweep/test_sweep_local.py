@@ -199,9 +199,9 @@ def paced(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Paced]:
         | {"stages": SWEEP["stages"][:1], "seeds": [0, 1], "resources": {"num_cpus": 1}}
         | {"environments": {"Point": slow}, "defaults": defaults}
     )
-    driver = program.start_until(" 200 of 2,000 env steps")
-    yield Paced(program, fast, driver)
-    end(driver)
+    with program.start_until(" 200 of 2,000 env steps") as driver:  # which closes its pipes
+        yield Paced(program, fast, driver)
+        end(driver)
 
 
 def test_every_query_of_the_dashboard_returns_data_of_a_running_sweep(
