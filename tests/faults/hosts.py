@@ -66,7 +66,10 @@ class Network(threading.Thread):
         while not self._closed:
             due = self._late[0][0] - time.monotonic() if self._late else 0.1
             for wire in select.select(list(sources), [], [], min(0.1, max(0.0, due)))[0]:
-                source, frame = sources[wire], os.read(wire, 65536)
+                try:
+                    source, frame = sources[wire], os.read(wire, 65536)
+                except OSError:  # its machine has ended, by Ctrl-C before `close`
+                    continue
                 for target in self._targets(source, frame):
                     if {source, target} & self.cut:
                         continue
