@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Self
-from urllib.parse import urlsplit
+from urllib.parse import parse_qsl, urlsplit
 
 from music_rllib.errors import TrackingError
 from music_rllib.experiment.sweep_files import SweepLocation, as_json
@@ -158,6 +158,12 @@ def resolve_store(tracking_uri: str | None, storage: str) -> TrackingStore:
     uri, known = database_url(tracking_uri), database_url(os.environ.get(VARIABLE, ""))
     if redact(known) == uri:  # the sweep has its URI without the password
         uri = known
+    if storage.startswith("s3://") and not is_server:
+        options = dict(parse_qsl(urlsplit(storage).query))
+        if endpoint := options.get("endpoint_override"):  # MLflow writes artifacts there itself
+            if "://" not in endpoint:
+                endpoint = f"{options.get('scheme', 'https')}://{endpoint}"
+            os.environ.setdefault("MLFLOW_S3_ENDPOINT_URL", endpoint)
     return TrackingStore(uri=uri, artifact_root=None if is_server else artifacts)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import threading
 import time
@@ -93,6 +94,24 @@ def test_a_server_keeps_its_artifacts_itself() -> None:
     assert store.artifact_root is None
     assert store.ui_command() == "http://mlflow:5000"
     assert store.pages == "http://mlflow:5000"
+
+
+@pytest.mark.parametrize(
+    ("options", "endpoint"),
+    [
+        ("endpoint_override=minio:9000&scheme=http", "http://minio:9000"),
+        ("endpoint_override=http%3A%2F%2Fminio%3A9000", "http://minio:9000"),
+        ("endpoint_override=s3.lab", "https://s3.lab"),
+        ("region=eu", None),
+    ],
+)
+def test_mlflow_writes_artifacts_to_the_endpoint_of_the_storage(
+    options: str, endpoint: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MLFLOW_S3_ENDPOINT_URL", "")  # restored after the test
+    monkeypatch.delenv("MLFLOW_S3_ENDPOINT_URL")
+    resolve_store("sqlite:////x.db", f"s3://bucket/sweeps?{options}")
+    assert os.environ.pop("MLFLOW_S3_ENDPOINT_URL", None) == endpoint
 
 
 def test_a_database_keeps_artifacts_in_the_storage() -> None:
