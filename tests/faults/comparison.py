@@ -28,11 +28,15 @@ def nodes(storage: Path) -> Numbers:
 
 
 def weights(storage: Path) -> dict[str, bytes]:
-    """Every file of network weights in a handoff."""
-    return {
-        str(path.relative_to(storage)): path.read_bytes()
-        for path in sorted((storage / "nodes").rglob("*.safetensors"))
-    }
+    """Every file of network weights in a handoff.
+
+    In a bucket, a node's files are in a folder of the attempt that finished it.
+    """
+    nodes = storage / "nodes"
+    paths = sorted(nodes.rglob("*.safetensors"))
+    found = {f"{path.relative_to(nodes).parts[0]}/{path.name}": path.read_bytes() for path in paths}
+    assert len(found) == len(paths), "an unfinished attempt has left its weights"
+    return found
 
 
 def without_machine(metrics: dict[str, float]) -> dict[str, float]:

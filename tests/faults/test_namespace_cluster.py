@@ -31,7 +31,6 @@ ENVIRONMENT = {
     "RAY_AUTH_TOKEN": TOKEN,
     "AWS_ACCESS_KEY_ID": "testing",
     "AWS_SECRET_ACCESS_KEY": "testing",
-    "MLFLOW_S3_ENDPOINT_URL": S3,
     "OMP_NUM_THREADS": "1",
     "NO_COLOR": "1",
     "PYTHONUNBUFFERED": "1",
