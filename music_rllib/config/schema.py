@@ -195,7 +195,7 @@ class Analysis(StrictModel):
     metric: Literal["auc", "auc_total", "final"] = "auc"
     """Number to compare. `auc`: the mean of the task's primary metric over the budget (the area
     under the learning curve). `auc_total`: the same over all steps, those of pretraining stages
-    included, so that a pretrained run has no steps for free. `final`: the last value."""
+    included, so that pretraining is not free. `final`: the last value."""
     margin: float | None = Field(None, gt=0)
     """Margin of equivalence tests: smaller differences do not matter. null: 0.05 for a success
     rate; required for a return. If tasks of both kinds are compared, a margin of 1 or more applies
