@@ -103,7 +103,11 @@ def test_every_page_is_on_the_documentation_site() -> None:
 
 
 @pytest.mark.parametrize(
-    "study", ["q_entropy_factorial", "claims_push", "claims_pick_and_place", "claims_slide"]
+    "study",
+    [
+        *("q_entropy_factorial", "claims_push", "claims_pick_and_place", "claims_slide"),
+        "joint_push",
+    ],
 )
 def test_the_plan_of_the_claims_is_that_of_their_sweeps(study: str) -> None:
     plan = analysis_plan(load_config(ROOT / "tune_configs" / f"{study}.yaml"))
