@@ -189,7 +189,7 @@ def check_analysis(
         findings.add(("analysis", "stage"), rule)
         return
     default = analysis.stage or next(reversed(list(stages)), "")
-    metrics = set()
+    metrics, unknown = set(), set()
     for position, text in enumerate(analysis.hypotheses):
         path = ("analysis", "hypotheses", position)
         for condition in Hypothesis.of(text).sides:
@@ -200,8 +200,10 @@ def check_analysis(
                 metrics |= {task.primary_metric for task in stage.tasks}
                 if broken := _broken_rule(stage, condition) or _broken_final(stage, condition):
                     findings.add(path, broken)
-                if analysis.metric == "auc_total" and (unknown := _unknown_steps(stage, stages)):
-                    findings.add(("analysis", "metric"), unknown)
+                if analysis.metric == "auc_total" and (rule := _unknown_steps(stage, stages)):
+                    unknown.add(rule)
+    for rule in sorted(unknown):  # once, however many hypotheses name the stage
+        findings.add(("analysis", "metric"), rule)
     if analysis.margin is None and names.EVAL_RETURN in metrics:
         findings.add(("analysis", "margin"), "must be given for tasks without success, got null")
     if (analysis.margin or 0) >= 1 and metrics == {names.EVAL_SUCCESS}:
