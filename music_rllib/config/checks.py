@@ -200,8 +200,8 @@ def check_analysis(
                 metrics |= {task.primary_metric for task in stage.tasks}
                 if broken := _broken_rule(stage, condition) or _broken_final(stage, condition):
                     findings.add(path, broken)
-                if analysis.metric == "auc_total" and (rule := _unknown_steps(stage, stages)):
-                    unknown.add(rule)
+                if analysis.metric == "auc_total" and (found := _unknown_steps(stage, stages)):
+                    unknown.add(found)
     for rule in sorted(unknown):  # once, however many hypotheses name the stage
         findings.add(("analysis", "metric"), rule)
     if analysis.margin is None and names.EVAL_RETURN in metrics:
