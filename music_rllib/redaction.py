@@ -14,15 +14,15 @@ MAX_PARAM_LENGTH = 6000
 """Longest value of an MLflow param, in characters."""
 
 _NAMES = (
-    r"password|passwd|passphrase|pwd|secret|token|credential|authorization"
-    r"|(?:api|access|private)[_-]?key"
+    r"password|passwd|passphrase|pwd|secret|token|credential|authorization|cookie"
+    r"|(?:api|access|private|account)[_-]?key"
 )
-_SHORT_NAMES = r"(?<![A-Za-z])(?:pass|pw)(?![A-Za-z])"
+_SHORT_NAMES = r"(?<![A-Za-z])(?:pass|pw|auth)(?![A-Za-z])"
 """Parts of other words, so they must stand alone: `DB_PASS`, not `bypass`."""
 _ITEM = r"""(?:'[^'\n]{0,999}'|"[^"\n]{0,999}"|[^'"()\[\]{}\n])"""
 _VALUE = rf"""(?:
     [bfru]{{0,2}}(?:\"{{3}}.{{0,9999}}?(?:\"{{3}}|\Z)|\'{{3}}.{{0,9999}}?(?:\'{{3}}|\Z))
-    |[bfru]{{0,2}}\\?(?P<quote>["'])(?:\\.|[^\\\n]){{0,9999}}?(?P=quote)
+    |[bfru]{{0,2}}(?P<quote>\\?["'])(?:\\.|[^\\\n]){{0,9999}}?(?P=quote)
     |[(\[{{](?:{_ITEM}|[(\[{{]{_ITEM}{{0,999}}[)\]}}]){{1,999}}[)\]}}]
     |(?:(?:Bearer|Basic)\s+)?[^\s,;&)}}\]'"]+
 )"""
@@ -41,12 +41,13 @@ _SECRETS = tuple(
         r"(?P<name>\bBearer(?P<equals>\s+))[\w.~+/=\-]+",
         # An option of a command: --password x.
         rf"""(?P<name>(?<![\w\-])--?(?:[\w\-]{{0,40}}?(?:{_NAMES})[\w\-]{{0,40}}
-        |(?:[\w\-]{{0,40}}-)?(?:pass|pw))(?P<equals>[ \t]+))(?!-){_VALUE}""",
+        |(?:[\w\-]{{0,40}}-)?(?:pass|pw|auth))(?P<equals>[ \t]+))(?!-){_VALUE}""",
         # An assignment by = or :, perhaps with its value on the next line.
         rf"""(?P<name>(?:(?:{_NAMES})[\w\-]{{0,40}}
         |{_SHORT_NAMES}(?=\\?["']|\s{{0,9}}=|(?<=_pass):)|signature(?=\s{{0,9}}=))
-        \\?["']?\s{{0,9}}(?:(?P<equals>=)|:)[ \t]{{0,9}}
-        (?:\\?\n[ \t]{{0,40}}(?![\w.\-]{{1,40}}[ \t]{{0,9}}[:=](?:\s|$)))?){_VALUE}""",
+        \\?["']?\s{{0,9}}(?:(?P<equals>:?=[=>]?)|:)[ \t]{{0,9}}
+        (?:(?:[|>][+\-]?|\\)?\n[ \t]{{0,40}}(?![\w.\-]{{1,40}}[ \t]{{0,9}}[:=](?:\s|$)))?)
+        {_VALUE}""",
     )
 )
 # C0 and C1 controls except line breaks and tabs, marks that change the direction of writing,

@@ -124,7 +124,9 @@ PLACES = (
     *("run --password § --n 3", "run --db-pass §", "run -token '§'", "run --password=§"),
     *("https://u:p@§/w@host/x", "https://u:§@host/x", "s3://K:§@bucket"),
     *("https://h/x?sig=§&a=1", "https://h/x?a=1&X-Amz-Signature=§", "h?X-Amz-Credential=§"),
-    *("Authorization: Basic §", "Bearer §", "AWS4 Credential=K, Signature=§"),
+    *("Authorization: Basic §", "Bearer §", "AWS4 Credential=K, Signature=§", "Cookie: a=§"),
+    *("get(u, auth=('u', '§'))", r"{\"password\": \"§\"}", "secret: |-\n  §", "a;AccountKey=§;b"),
+    *("password := '§'", '"password" => "§"', "if password == '§'", "--auth u:§"),
 )
 
 
