@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
-from scipy import stats
+from scipy.special import betaincinv, stdtr, stdtrit
 
 from music_rllib import names
 from music_rllib.config.schema import Hypothesis
@@ -86,7 +86,7 @@ class Contrast:
         none was drawn, no test of these seeds can detect it.
         """
         seeds = min(self.seeds)
-        return np.asarray(stats.beta.ppf(POWER, self.collapsed + 1, seeds - self.collapsed))
+        return np.asarray(betaincinv(self.collapsed + 1, seeds - self.collapsed, POWER))
 
 
 def contrast(
@@ -115,10 +115,10 @@ def contrast(
 
     def p_greater(difference: Array) -> Array:
         """One-sided p-value of a mean difference of this size."""
-        return np.asarray(np.nan_to_num(stats.t.sf(difference / error, freedom), nan=1.0))
+        return np.asarray(np.nan_to_num(stdtr(freedom, -difference / error), nan=1.0))
 
     def with_interval(level: float) -> Estimate:
-        half = stats.t.ppf((1 + level) / 2, freedom) * error
+        half = stdtrit(freedom, (1 + level) / 2) * error
         return Estimate(value=value, lower=value - half, upper=value + half)
 
     p_equivalent = None

@@ -167,7 +167,7 @@ def _half_width(
     if freedom == 0:
         return math.inf
     spread = math.sqrt(sum(squares for squares, _ in spreads) / freedom)
-    quantile = float(scipy.stats.t.ppf((1 + confidence) / 2, freedom))
+    quantile = float(scipy.special.stdtrit(freedom, (1 + confidence) / 2))
     return quantile * spread / math.sqrt(_effective_runs(objective, scores))
 
 

@@ -43,7 +43,7 @@ from music_rllib.runtime.machine import (
     cluster_address,
     ray_parent,
 )
-from music_rllib.runtime.process import early
+from music_rllib.runtime.process import early, without_collections
 from music_rllib.store.patience import be_patient
 from music_rllib.store.storage import check_storage, is_remote, resolve_storage
 from music_rllib.sweep import preflight
@@ -147,8 +147,9 @@ def run(
         BadInputError: Nothing was started; as other errors that name what to change.
     """
     # `plan` needs none of it.
-    from music_rllib.sweep.driver_lock import alone, driving
-    from music_rllib.sweep.execution import compute_and_report, open_tracker
+    with without_collections():
+        from music_rllib.sweep.driver_lock import alone, driving
+        from music_rllib.sweep.execution import compute_and_report, open_tracker
 
     console = console_for(as_json=as_json)
     warn = partial(_say, console, style="yellow")

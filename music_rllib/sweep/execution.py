@@ -11,7 +11,7 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from socket import gethostname
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
@@ -24,10 +24,7 @@ from music_rllib.experiment.scheduler import Status
 from music_rllib.experiment.sweep_files import SEARCH, as_json
 from music_rllib.redaction import redact
 from music_rllib.runtime.machine import cluster_address
-from music_rllib.runtime.process import give_back_freed_memory, try_for
-from music_rllib.search.controller import SearchController
-from music_rllib.search.outcome import outcome
-from music_rllib.search.searches import open_searches
+from music_rllib.runtime.process import give_back_freed_memory, try_for, without_collections
 from music_rllib.store.storage import below, is_remote, sweep_folder
 from music_rllib.sweep.driver_lock import Drivers, alone
 from music_rllib.sweep.listeners.mlflow_view import VERSIONS, comparison_view
@@ -37,6 +34,9 @@ from music_rllib.sweep.listeners.state_file import StateFile
 from music_rllib.sweep.views.results import results_table, search_views
 from music_rllib.tracking.listener import MlflowListener
 from music_rllib.tracking.tracker import Tracker
+
+if TYPE_CHECKING:
+    from music_rllib.search.controller import SearchController
 
 LAST_SECONDS = 20.0
 """Time to write the last state and to close MLflow's runs after Ray has died."""
@@ -165,7 +165,8 @@ def _compute(
     """Compute what is left, if anything; the signal that stopped it, or None."""
     if opened.scheduler.complete and (controller is None or controller.over):
         return None
-    from music_rllib.tune.runner import compute  # Ray and RLlib take seconds to load
+    with without_collections():
+        from music_rllib.tune.runner import compute  # Ray takes seconds to load
 
     address = cluster_address()
     display.say("starting a local Ray" if address is None else f"connecting to Ray at {address}")
@@ -224,6 +225,10 @@ def begin_searches(
     alone: bool,
 ) -> SearchController:
     """Open the searches, add their earlier trials, and plan the first runs."""
+    # Optuna takes a third of a second to load.
+    from music_rllib.search.controller import SearchController
+    from music_rllib.search.outcome import outcome
+    from music_rllib.search.searches import open_searches
 
     def reused(node: Node) -> None:
         mlflow_log.finished(node)
@@ -246,6 +251,8 @@ def end_searches(
     opened: OpenSweep, controller: SearchController, tracker: Tracker
 ) -> list[dict[str, Any]]:
     """Stop the searches, and save their outcome in the sweep's folder and in MLflow."""
+    from music_rllib.search.outcome import outcome
+
     controller.stop()
     searches = outcome(controller)
     if searches:

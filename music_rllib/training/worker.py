@@ -5,12 +5,14 @@ from __future__ import annotations
 import contextlib
 import gc
 import time
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from ray.tune import PlacementGroupFactory, Trainable
 
 from music_rllib import names
 from music_rllib.redaction import redact
+from music_rllib.runtime.process import without_collections
 from music_rllib.store.history import Report, to_json_lines
 from music_rllib.store.lease import LeaseLostError
 from music_rllib.store.patience import be_patient
@@ -153,12 +155,10 @@ class RunTrainable(Trainable):
 
     def _begin(self) -> TrainingRun:
         """Build the run and restore its checkpoint, if it has one."""
-        from music_rllib.training.run import TrainingRun
-
         self._start_watch()
         self._run_storage.check_environment()
         weights = self._run_storage.source_weights()
-        training = TrainingRun(self._job.run, weights, self._job.resources.gpus_per_run)
+        training = _training_run()(self._job.run, weights, self._job.resources.gpus_per_run)
         self._history, self._seconds_before = self._run_storage.restore(training)
         self._began = self._saved_at = time.monotonic()
         return training
@@ -243,3 +243,12 @@ class RunTrainable(Trainable):
             self._release()
         if self._training is not None:
             self._training.close()
+
+
+@cache
+def _training_run() -> type[TrainingRun]:
+    """The class; importing its libraries takes seconds."""
+    with without_collections():
+        from music_rllib.training.run import TrainingRun
+
+        return TrainingRun

@@ -86,13 +86,18 @@ def test_lower_layers_load_no_ray() -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_a_driver_begins_without_what_only_workers_or_reports_need() -> None:
-    """Each takes a second or more, of which a user would wait for the plan."""
-    heavy = ["ray", "torch", "mlflow", "scipy.stats", "pandas", "matplotlib"]
+def test_a_driver_loads_only_what_it_needs() -> None:
+    """Each takes a third of a second or more, and memory for as long as the sweep lasts."""
+    never = ["torch", "scipy.stats", "matplotlib", "optuna"]  # optuna: without a search
     code = (
-        "import sys, music_rllib.sweep.driver\n"
-        f"loaded = [name for name in {heavy!r} if name in sys.modules]\n"
-        "assert not loaded, loaded\n"
+        "import sys\n"
+        "def check(*heavy):\n"
+        "    loaded = [name for name in heavy if name in sys.modules]\n"
+        "    assert not loaded, loaded\n"
+        "import music_rllib.sweep.driver\n"
+        f"check('ray', 'mlflow', 'pandas', *{never!r})\n"  # a user waits for the plan
+        "import music_rllib.sweep.execution, music_rllib.tune.runner\n"
+        f"check(*{never!r})\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
