@@ -230,15 +230,9 @@ def _open(
     _say(console, f"Storage: {redact(storage)}")
     cluster = preflight.find_cluster(console, opened, wait_minutes)
     memory = None if cluster is None else cluster.node_memory
-    notes = (
-        remark,
-        *played,
-        *warnings_of(config),
-        *shared_runs(planned),
-        *check_demand(opened, memory),
-        *continued_runs_text(opened),
-    )
-    for line in filter(None, notes):
+    check_demand(opened, memory)
+    warnings = (*warnings_of(config), *shared_runs(planned), *continued_runs_text(opened))
+    for line in filter(None, (remark, *played, *warnings)):
         _say(console, line, "yellow")
     return opened, cluster
 

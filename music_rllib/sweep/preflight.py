@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from functools import partial
 from itertools import pairwise
 from operator import attrgetter
@@ -23,7 +23,7 @@ from rich.console import Console
 from music_rllib.config.problems import shown
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.envs.fingerprint import Fingerprint, fingerprint_of
-from music_rllib.envs.tasks import BUILT_IN_TASKS, Task, folders_for_workers
+from music_rllib.envs.tasks import BUILT_IN_TASKS, folders_for_workers
 from music_rllib.errors import BadInputError
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.open_sweep import OpenSweep
@@ -240,137 +240,61 @@ def find_cluster(
     return capacity
 
 
-# Memory and time ----------------------------------------------------------------------------------
-# Lower bounds, computed from the settings. Memory omits everything that does not depend on them:
-# the interpreter, its libraries, an environment's own data. The size of an observation is taken
-# from the largest index of the task's agent and surroundings.
-
-FLOAT = 4
-"""Bytes of a number."""
-STEPS_PER_SECOND = 50_000
-"""Environment steps per second of the fastest simulations."""
-UPDATES_PER_SECOND = 10_000
-"""Gradient updates per second of small networks on the fastest hardware."""
-LONG_DAYS = 60
-"""A run that takes longer at these rates is probably a mistake."""
-ENVIRONMENT_BYTES = 10_000
-"""Memory of one sub-environment; MuJoCo's take a hundred times as much."""
-
-
 class DemandError(BadInputError, ValueError):
     """A run does not fit on any available machine."""
 
 
-def check_demand(sweep: OpenSweep, node_memory: float | None = None) -> list[str]:
-    """Check that the unfinished runs fit into memory.
+def check_demand(sweep: OpenSweep, node_memory: float | None = None) -> None:
+    """Check that each unfinished run fits into memory.
 
     Args:
         sweep: The sweep.
         node_memory: Bytes of the largest node of a cluster; None: this machine's memory counts.
 
-    Returns:
-        Warnings about runs that would take months or years.
-
     Raises:
         DemandError: A run does not fit.
     """
     runs = [(node.stage, node.run) for node in sweep.plan.nodes if node.key not in sweep.finished]
-    for stage in sweep.config.stages:
-        if stage.search is not None:
-            runs += [(stage.name, run) for run in stage.points[0].runs.values()]
+    for stage in sweep.plan.searched:
+        runs += [(stage.name, run) for run in stage.points[0].runs.values()]
     if node_memory is None:
         check_memory(runs, "this machine", memory_of_machine())
     else:
         check_memory(runs, "the cluster's largest node", node_memory)
-    return list(long_runs(runs))
 
 
 def check_memory(runs: Iterable[tuple[str, RunSettings]], place: str, memory: float) -> None:
     """Check that each of `runs`, given with the names of their stages, fits into `memory` bytes.
 
     Raises:
-        DemandError: A run does not fit; the message names the settings that need most.
+        DemandError: A run does not fit; the message names the setting that needs most.
     """
     for stage, run in runs:
-        if least_memory(run) > memory:
-            settings, amount = max(_memory(run).items(), key=lambda item: item[1])
-            values = " and ".join(shown(attrgetter(setting)(run)) for setting in settings)
+        needed = _least_memory(run)
+        setting = max(needed, key=lambda name: needed[name])
+        if sum(needed.values()) > memory:
             raise DemandError(
-                f"stage {stage}: {' and '.join(settings)} must fit into the memory of {place}, "
-                f"{_gib(memory)}, got {values}, for which a run on {run.task.name} needs at least "
-                f"{_gib(amount)}"
+                f"stage {stage}: {setting} must fit into the memory of {place}, "
+                f"{memory / 2**30:.1f} GiB, got {shown(attrgetter(setting)(run))}, for which a run "
+                f"on {run.task.name} needs at least {needed[setting] / 2**30:.3g} GiB"
             )
 
 
-def least_memory(run: RunSettings) -> int:
-    """Bytes that a run needs at least."""
-    return sum(_memory(run).values())
+def _least_memory(run: RunSettings) -> dict[str, int]:
+    """Bytes that a run needs at least, by the setting that causes them.
 
-
-def _memory(run: RunSettings) -> dict[tuple[str, ...], int]:
-    """Bytes that a run needs at least, by the settings that cause them."""
-    tac, replay, music, horizon = run.tac, run.replay, run.music, run.task.horizon
-    observation, units = _observation(run.task), music.hidden_size
-    row = FLOAT * (observation + 3)  # with action, reward, and whether the episode ended
-    has_estimator = music.estimator != "none"
+    An observation counts up to the largest index of the task's agent and surroundings.
+    """
+    tac, task = run.tac, run.task
+    observation = 1 + max((*task.agent_indices, *task.surrounding_indices), default=0)
+    row = 4 * (observation + 3)  # with action, reward, and whether the episode ended
+    weights = sum(above * below for above, below in pairwise((observation, *tac.hidden_sizes, 1)))
     return {
-        ("tac.hidden_sizes",): FLOAT * _network_numbers(run, observation),
-        ("tac.batch_size", "tac.hidden_sizes"): tac.batch_size
-        * (row + FLOAT * sum(tac.hidden_sizes)),
-        ("replay.capacity",): replay.capacity * row,
+        # Weights, gradients and Adam's two moments of the policy and the critics.
+        "tac.hidden_sizes": 4 * 4 * (1 + tac.critic_count) * weights,
+        "tac.batch_size": tac.batch_size * row,
+        "replay.capacity": run.replay.capacity * row,
         # An evaluation keeps all of its trajectories until it ends.
-        ("evaluation.episodes",): run.evaluation.episodes * horizon * row,
-        ("num_envs",): run.num_envs * (ENVIRONMENT_BYTES + horizon * row),
-        ("music.hidden_size",): has_estimator * 4 * FLOAT * units * (observation + 2),
-        ("music.batch_trajectories", "music.hidden_size"): has_estimator
-        * (FLOAT * music.batch_trajectories * horizon * (observation + units)),
+        "evaluation.episodes": run.evaluation.episodes * task.horizon * row,
+        "num_envs": run.num_envs * 10_000,
     }
-
-
-def _network_numbers(run: RunSettings, observation: int) -> int:
-    """Numbers of all networks: weights, gradients, Adam's two moments, and target networks."""
-    tac = run.tac
-    policy = _weights(observation, tac.hidden_sizes)
-    critics = tac.critic_count * _weights(observation + 1, tac.hidden_sizes)
-    value = policy if tac.bootstrap == "value" else 0
-    return 4 * (policy + critics + value) + (value or critics)
-
-
-def _weights(inputs: int, hidden_sizes: tuple[int, ...]) -> int:
-    """Weights and biases of a multilayer perceptron with one output."""
-    sizes = [inputs, *hidden_sizes, 1]
-    return sum((fan_in + 1) * fan_out for fan_in, fan_out in pairwise(sizes))
-
-
-def _observation(task: Task) -> int:
-    """Size of an observation, up to the largest index of the task."""
-    return 1 + max((*task.agent_indices, *task.surrounding_indices), default=0)
-
-
-def long_runs(runs: Iterable[tuple[str, RunSettings]]) -> Iterator[str]:
-    """One line per stage and task whose runs would take months or years on any hardware."""
-    seen = set()
-    for stage, run in runs:
-        days = _least_seconds(run) // 86_400
-        if days >= LONG_DAYS and (stage, run.task.name) not in seen:
-            seen.add((stage, run.task.name))
-            yield (
-                f"stage {stage}: a run on {run.task.name} takes at least {_number(days)} days on "
-                "the fastest hardware; see env_steps, tac.replay_ratio and evaluation"
-            )
-
-
-def _least_seconds(run: RunSettings) -> int:
-    """Seconds that a run takes at least."""
-    evaluations = 1 - (-run.env_steps // run.evaluation.interval)
-    played = evaluations * run.evaluation.episodes * run.task.horizon
-    updates = (run.env_steps - run.tac.steps_before_updates) * int(run.tac.replay_ratio)
-    return (run.env_steps + played) // STEPS_PER_SECOND + max(updates, 0) // UPDATES_PER_SECOND
-
-
-def _gib(amount: float) -> str:
-    return f"{_number(amount / 2**30 if amount < 10**30 else int(amount) // 2**30)} GiB"
-
-
-def _number(value: float) -> str:
-    return f"{value:,.1f}" if value < 1e6 else f"{min(value, 10**300):.1e}"
