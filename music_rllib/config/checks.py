@@ -46,7 +46,7 @@ def check_search(
         if rule := _broken_metric(objective.metric, stage):
             several = (position,) if len(search.objectives) > 1 else ()
             in_search.add(("objective", *several, "metric"), rule)
-    above = source = _source_of(stage, earlier)
+    above = source = earlier.get(str(stage.source_stage))
     while source is not None:
         if source.search is None and len(source.points) > 1:
             findings.add(
@@ -54,7 +54,7 @@ def check_search(
                 "must lead to stages without a grid where trials are searched, got "
                 f"{source.name!r}; search its settings as '{source.name}:...'",
             )
-        source = _source_of(source, earlier)
+        source = earlier.get(str(source.source_stage))
     if foreign := search.stages - ({above.name} if above else set()):
         known = f", which is {above.name!r}" if above else "; this one starts from none"
         in_search.add(
@@ -67,11 +67,6 @@ def check_search(
     _check_points_to_evaluate(search, in_search)
     if len(findings.problems) == problems_before:  # the budget is a valid number then
         _check_rungs(search, seeds, stage.most_env_steps, in_search)
-
-
-def _source_of(stage: Stage, earlier: Mapping[str, Stage | None]) -> Stage | None:
-    """The stage that a stage's runs start from; None if there is none, or an invalid one."""
-    return earlier.get(stage.source.stage) if stage.source and stage.source.stage else None
 
 
 def _broken_metric(metric: str, stage: Stage) -> str | None:
@@ -220,7 +215,7 @@ def _unknown_steps(stage: Stage, stages: Mapping[str, Stage | None]) -> str | No
                 "must not be auc_total where pretraining is outside the sweep: "
                 f"{source.name!r} starts from a checkpoint"
             )
-        source = stages.get(source.source.stage or "")
+        source = stages.get(str(source.source_stage))
     return None
 
 

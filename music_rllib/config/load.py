@@ -236,8 +236,7 @@ def _count_runs(stages: Mapping[str, Stage | None], seeds: int, findings: Findin
     for index, (name, stage) in enumerate(stages.items()):
         if stage is None or stage.search is not None:
             continue
-        above = stage.source.stage if stage.source else None
-        trials[name] = len(stage.points) * trials.get(str(above), 1)
+        trials[name] = len(stage.points) * trials.get(str(stage.source_stage), 1)
         total += trials[name] * len(stage.tasks) * seeds
         if total > MOST_RUNS:
             rule = f"must not make the sweep larger than {MOST_RUNS:,} runs, got {total:,}"

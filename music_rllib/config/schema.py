@@ -336,6 +336,11 @@ class Stage:
     """Gives the point with dotted settings in place of this stage's; raises ConfigError."""
 
     @property
+    def source_stage(self) -> str | None:
+        """Name of the earlier stage that its runs start from."""
+        return self.source.stage if self.source else None
+
+    @property
     def primary_metric(self) -> str:
         """The metric for comparing its runs: success if each task has it, otherwise return."""
         metrics = {task.primary_metric for task in self.tasks}
@@ -385,6 +390,10 @@ class SweepConfig:
     checkpoints: Checkpoints
     analysis: Analysis | None
     stages: tuple[Stage, ...]
+
+    def source_of(self, stage: Stage) -> Stage | None:
+        """The earlier stage that the runs of a stage start from."""
+        return next((one for one in self.stages if one.name == stage.source_stage), None)
 
     def stage(self, name: str | None = None) -> Stage:
         """The stage with this name; without a name, the stage of the analysis, or the last one.

@@ -329,7 +329,7 @@ def is_continuable(run: RunSettings) -> bool:
 def make_plan(config: SweepConfig, *, algorithm: str | None = None) -> Plan:
     """The plan of a sweep, with keys of the present or of a given version of the algorithm."""
     plan = Plan(config.name, config.seeds, algorithm=algorithm)
-    sources = [(stage.search, stage.source.stage) for stage in config.stages if stage.source]
+    sources = [(stage.search, stage.source_stage) for stage in config.stages]
     varied = {source for search, source in sources if search and source in search.stages}
     used = {source for search, source in sources if not (search and source in varied)}
     for stage in config.stages:

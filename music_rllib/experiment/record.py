@@ -324,7 +324,7 @@ def _changed_searches(
             for line in _changed_settings(earlier[task], after[task])
             if not any(f"{stage.name}:{line}".startswith((f"{one}:", f"{one}.")) for one in chosen)
         }
-        if lines or (stage.source and stage.source.stage in changed):
+        if lines or stage.source_stage in changed:
             changed.append(stage.name)
             yield stage.name, lines
 

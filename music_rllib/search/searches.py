@@ -157,16 +157,9 @@ def _rungs(sweep: OpenSweep, stage: Stage, settings: SearchSettings) -> tuple[Ru
 def _determined_by(sweep: OpenSweep, stage: Stage) -> dict[str, Any]:
     """Plain data of the settings that the stage's runs share, except the searched ones."""
     (point,) = stage.points
-    source = stage.source
-    source_runs = next(
-        (
-            above.points[0].runs
-            for above in sweep.config.stages
-            if source is not None and above.name == source.stage
-        ),
-        {},
-    )
-    checkpoint = source.checkpoint if source is not None else None
+    above = sweep.config.source_of(stage)
+    source_runs = above.points[0].runs if above else {}
+    checkpoint = stage.source.checkpoint if stage.source else None
     # Values of another environment do not count. The earliest stands for all equal ones.
     codes = {run.code for run in (*point.runs.values(), *source_runs.values())}
     tasks = sorted(codes & sweep.environments.now.keys())

@@ -227,7 +227,7 @@ class StateFile(Listener):
             asked = [run for run in plan.runs if run.stage == stage.name]
             if stage.search is None or any(run.part.startswith("final") for run in asked):
                 continue  # the runs on fresh seeds come last and all at once
-            at_most = sum(one.runs * one.env_steps for one in searched_runs(config, stage))
+            at_most = sum(one.all_env_steps for one in searched_runs(config, stage))
             known = sum(node.run.env_steps for node in plan.nodes if node.stage == stage.name)
             steps += max(0, at_most - known)
         return steps

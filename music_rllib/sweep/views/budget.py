@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Collection, Iterator
+from collections import Counter
+from collections.abc import Collection
 from dataclasses import dataclass
 
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.schema import Stage, SweepConfig
-from music_rllib.experiment.plan import Plan
+from music_rllib.config.search import SearchSettings
+from music_rllib.experiment.plan import Node, Plan
 
 _WITHOUT_COST: dict[str, bool | set[str]] = {
     "seed": True,
@@ -23,58 +24,25 @@ _WITHOUT_COST: dict[str, bool | set[str]] = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class SearchBudget:
-    """Upper bounds over all studies and tasks: trials may stop early, and points repeat."""
-
-    trial_runs: int
-    """Runs of trials."""
-    trial_env_steps: int
-    """Environment steps of one of these runs."""
-    fresh_runs: int
-    """Runs of the final ranking, on fresh seeds."""
-    fresh_env_steps: int
-    """Environment steps of one of these runs."""
-
-    @property
-    def runs(self) -> int:
-        """All runs."""
-        return self.trial_runs + self.fresh_runs
-
-    @property
-    def env_steps(self) -> int:
-        """Environment steps of all runs together."""
-        return self.trial_runs * self.trial_env_steps + self.fresh_runs * self.fresh_env_steps
-
-
-def search_budget(stage: Stage, seeds: int) -> SearchBudget:
-    """The budget of a searched stage in a sweep with this number of seeds."""
-    search = stage.search
-    assert search is not None
-    env_steps = stage.most_env_steps
-    fresh_runs, fresh_env_steps = 0, env_steps
-    runs_per_seed = len(search.compared()) * len(stage.tasks)
-    if (final := search.final) is not None:
-        finalists = min(final.most(len(search.points_to_evaluate)), search.count)
-        fresh_runs = finalists * final.seeds * runs_per_seed
-        fresh_env_steps = final.env_steps or env_steps
-    return SearchBudget(
-        trial_runs=search.count * seeds * runs_per_seed,
-        trial_env_steps=env_steps,
-        fresh_runs=fresh_runs,
-        fresh_env_steps=fresh_env_steps,
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
 class RunGroup:
     """Runs of one stage and task that take equally long."""
 
-    label: str
+    stage: str
     runs: int
     """Runs left to train; at most, for a search."""
     settings: RunSettings
     env_steps: int
     """Environment steps of one run, on average."""
+
+    @property
+    def label(self) -> str:
+        """`stage/task`."""
+        return f"{self.stage}/{self.settings.task.name}"
+
+    @property
+    def all_env_steps(self) -> int:
+        """Environment steps of all runs together."""
+        return self.runs * self.env_steps
 
     @property
     def grad_updates(self) -> int:
@@ -85,75 +53,64 @@ class RunGroup:
 
 def run_groups(config: SweepConfig, plan: Plan, finished: Collection[str]) -> list[RunGroup]:
     """Groups of the runs that are left: those of the plan in its order, then those of searches."""
-    groups: dict[str, list[tuple[str, RunSettings]]] = {}
+    groups: dict[str, list[Node]] = {}
     for node in plan.nodes:
         if node.key not in finished:
-            label = f"{node.stage}/{node.run.task.name}"
-            alike = node.run.model_dump(mode="json", exclude=dict(_WITHOUT_COST))
-            groups.setdefault(json.dumps([label, alike]), []).append((label, node.run))
+            alike = node.run.model_dump_json(exclude=dict(_WITHOUT_COST))
+            groups.setdefault(f"{node.stage} {alike}", []).append(node)
     planned = [
         RunGroup(
-            label=group[0][0],
+            stage=group[0].stage,
             runs=len(group),
-            settings=group[0][1],
-            env_steps=round(sum(run.env_steps for _, run in group) / len(group)),
+            settings=group[0].run,
+            env_steps=round(sum(node.run.env_steps for node in group) / len(group)),
         )
         for group in groups.values()
     ]
     return planned + [group for stage in config.stages for group in searched_runs(config, stage)]
 
 
-def searched_runs(config: SweepConfig, stage: Stage) -> Iterator[RunGroup]:
-    """The runs that the search of a stage trains at most, and their source runs."""
-    if stage.search is None:
-        return
-    budget = search_budget(stage, len(config.seeds))
-    yield from _source_runs(config, stage, budget)
-    runs, fresh_runs = budget.trial_runs, budget.fresh_runs
-    if budget.fresh_env_steps == budget.trial_env_steps:
-        runs, fresh_runs = runs + fresh_runs, 0
-    for task in stage.tasks:
-        for text, count, env_steps in (
-            ("", runs, budget.trial_env_steps),
-            (", fresh seeds", fresh_runs, budget.fresh_env_steps),
-        ):
-            if count:
-                yield RunGroup(
-                    label=f"{stage.name}/{task.name}{text}",
-                    runs=count // len(stage.tasks),
-                    settings=stage.points[0].runs[task.name],
-                    env_steps=env_steps,
-                )
+def searched_runs(config: SweepConfig, stage: Stage) -> list[RunGroup]:
+    """The runs that the search of a stage trains at most, and the runs that these start from.
 
-
-def _source_runs(config: SweepConfig, stage: Stage, budget: SearchBudget) -> Iterator[RunGroup]:
-    """The runs of another stage that the trials start from, if the search varies them."""
+    Trials may stop early, and points repeat.
+    """
     search = stage.search
-    source = next((s for s in config.stages if stage.source and s.name == stage.source.stage), None)
-    if source is None or search is None:
-        return
-    names = [
-        name for name in (*search.space, *search.compare) if name.startswith(f"{source.name}:")
+    if search is None:
+        return []
+    studies, phases = len(search.compared()), [(search.count, len(config.seeds), None)]
+    if (final := search.final) is not None:
+        finalists = min(final.most(len(search.points_to_evaluate)), search.count)
+        phases.append((finalists, final.seeds, final.env_steps))
+    runs: Counter[tuple[str, str, int]] = Counter()
+    source = config.source_of(stage)
+    for fresh, (trials, seeds, env_steps) in enumerate(phases):
+        if source is not None:
+            points = _points_of(search, source.name)
+            # A source whose settings are not searched has its other runs in the plan.
+            count = min(trials * studies, points) if fresh or points > 1 else 0
+            for task, run in source.points[0].runs.items():
+                runs[source.name, task, run.env_steps] += count * seeds
+        for task in stage.points[0].runs:
+            runs[stage.name, task, env_steps or stage.most_env_steps] += trials * studies * seeds
+    return [
+        RunGroup(
+            stage=name,
+            runs=number,
+            settings=config.stage(name).points[0].runs[task],
+            env_steps=env_steps,
+        )
+        for (name, task, env_steps), number in runs.items()
+        if number
     ]
-    most = math.prod(
+
+
+def _points_of(search: SearchSettings, stage: str) -> int:
+    """The largest number of points that a search has in the settings of another stage."""
+    names = [name for name in (*search.space, *search.compare) if name.startswith(f"{stage}:")]
+    return math.prod(
         len(search.compare[name])
         if name in search.compare
         else search.space[name].size or search.count
         for name in names
     )
-    per_seed = len(stage.tasks) * len(config.seeds)
-    trials = min(budget.trial_runs // per_seed, most) if most > 1 else 0
-    counts = {"": trials * len(config.seeds)}
-    if (final := search.final) is not None:
-        finalists = budget.fresh_runs // (len(stage.tasks) * final.seeds)
-        counts[", fresh seeds"] = min(finalists, most) * final.seeds
-    for task in source.tasks:
-        for text, runs in counts.items():
-            if runs:
-                settings = source.points[0].runs[task.name]
-                yield RunGroup(
-                    label=f"{source.name}/{task.name}{text}",
-                    runs=runs,
-                    settings=settings,
-                    env_steps=settings.env_steps,
-                )

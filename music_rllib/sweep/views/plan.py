@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +28,7 @@ from music_rllib.schedules import Linear, Measured, Piecewise, value_at
 
 if TYPE_CHECKING:
     from music_rllib.runtime.ray_cluster import Capacity
-    from music_rllib.sweep.views.budget import SearchBudget
+    from music_rllib.sweep.views.budget import RunGroup
 
 SAMPLED = 50
 """Largest number of finished runs whose speed is averaged."""
@@ -39,14 +39,13 @@ def plan_view(config: SweepConfig, plan: Plan, finished: Collection[str]) -> Ren
     heads = ("stage", "trials", "runs", "env steps per run", "env steps", "finished")
     table = new_table(f"Sweep {plan.name}", heads, left=["stage"])
     seeds = len(config.seeds)
-    budgets = _budgets(config)
+    searched = _searched_runs(config)
     for stage in config.stages:
-        cells = _stage_cells(stage, plan, finished, budgets.get(stage.name))
+        cells = _stage_cells(stage, plan, finished, searched.get(stage.name, ()))
         table.add_row(stage.name, *cells)
     lines = [*(_stage_text(stage, seeds) for stage in config.stages), _summary(plan, finished)]
-    if budgets:
-        runs = sum(budget.runs for budget in budgets.values())
-        steps = sum(budget.env_steps for budget in budgets.values())
+    if groups := [group for of_stage in searched.values() for group in of_stage]:
+        runs, steps = sum(one.runs for one in groups), sum(one.all_env_steps for one in groups)
         lines[-1] += f" Searches: up to {runs} more runs and {steps:,} more env steps"
         fresh = any(one.search and one.search.final and one.source for one in config.stages)
         lines[-1] += ", without the source runs of fresh seeds." if fresh else "."
@@ -56,26 +55,29 @@ def plan_view(config: SweepConfig, plan: Plan, finished: Collection[str]) -> Ren
     return Group(*parts)
 
 
-def _budgets(config: SweepConfig) -> dict[str, SearchBudget]:
-    """Name of each searched stage to the budget of its search."""
+def _searched_runs(config: SweepConfig) -> dict[str, list[RunGroup]]:
+    """Name of each searched stage to the runs of its search, without those they start from."""
     searched = [stage for stage in config.stages if stage.search is not None]
     if not searched:
         return {}
-    from music_rllib.sweep.views.budget import search_budget
+    from music_rllib.sweep.views.budget import searched_runs
 
-    return {stage.name: search_budget(stage, len(config.seeds)) for stage in searched}
+    return {
+        stage.name: [one for one in searched_runs(config, stage) if one.stage == stage.name]
+        for stage in searched
+    }
 
 
 def _stage_cells(
-    stage: Stage, plan: Plan, finished: Collection[str], budget: SearchBudget | None
+    stage: Stage, plan: Plan, finished: Collection[str], searched: Sequence[RunGroup]
 ) -> list[str]:
-    if stage.search is not None and budget is not None:
+    if stage.search is not None:
         studies, trials = len(stage.search.compared()), stage.search.count
         return [
             f"{studies} x {trials}" if studies > 1 else str(trials),
-            f"≤ {budget.runs}",
-            f"≤ {max(budget.trial_env_steps, budget.fresh_env_steps):,}",
-            f"≤ {budget.env_steps:,}",
+            f"≤ {sum(group.runs for group in searched)}",
+            f"≤ {max(group.env_steps for group in searched):,}",
+            f"≤ {sum(group.all_env_steps for group in searched):,}",
             "-",
         ]
     runs = [run for run in plan.runs if run.stage == stage.name]
@@ -162,7 +164,7 @@ def _summary(plan: Plan, finished: Collection[str]) -> str:
 def plan_answer(opened: OpenSweep, changes: str) -> dict[str, Any]:
     """The plan as plain data, with the changes since the last run of the sweep."""
     config, plan = opened.config, opened.plan
-    budgets = _budgets(config)
+    searched = _searched_runs(config)
     searches = [
         {
             "stage": stage.name,
@@ -170,7 +172,7 @@ def plan_answer(opened: OpenSweep, changes: str) -> dict[str, Any]:
             "sampler": stage.search.sampler,
             "studies": len(stage.search.compared()),
             "trials": stage.search.count,
-            "runs_at_most": budgets[stage.name].runs,
+            "runs_at_most": sum(group.runs for group in searched[stage.name]),
             "space": stage.search.model_dump(mode="json", by_alias=True)["space"],
         }
         for stage in config.stages
