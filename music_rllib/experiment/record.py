@@ -11,13 +11,12 @@ import contextlib
 import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from music_rllib.config.run_settings import RETIRED
 from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment.open_sweep import FINISHED, OpenSweep
-from music_rllib.experiment.plan import Node, Plan, budget_settings, continuation_key
+from music_rllib.experiment.plan import Node, budget_settings, continuation_key
 from music_rllib.experiment.sweep_files import (
     CONFIG,
     IN_STORAGE,
@@ -33,10 +32,6 @@ from music_rllib.store.storage import StorageError, database_url
 
 SHOWN = 10
 """Lines of each list that are shown."""
-MOST_REASONS = 4
-"""Largest number of reasons in a sentence about earlier runs."""
-MOST_SETTINGS = 3
-"""Largest number of settings in a reason."""
 
 
 # Writing the record -------------------------------------------------------------------------------
@@ -130,62 +125,11 @@ def _searched(sweep: OpenSweep) -> dict[str, dict[str, Any]]:
 
 
 def _earlier_runs(sweep: OpenSweep) -> list[dict[str, Any]]:
-    """The runs in `plan.json` that the plan does not have: `key`, `label` and `why` of each."""
+    """The runs in `plan.json` that the plan does not have: `key` and `label` of each."""
     recorded = sweep.location.read(PLAN) or {"nodes": []}
     known = {one["key"]: one for one in (*recorded["nodes"], *recorded.get("earlier", ()))}
     gone = known.keys() - {node.key for node in sweep.plan.nodes}
-    settings = (sweep.location.read(SETTINGS) or {}) if gone else {}
-    return [
-        {
-            "key": key,
-            "label": one["label"],
-            "why": one.get("why") or _why(one, sweep.plan, settings),
-        }
-        for key, one in known.items()
-        if key in gone
-    ]
-
-
-def _why(old: Mapping[str, Any], plan: Plan, settings: Mapping[str, Any]) -> str:
-    """The property of an earlier run that no run of the plan has.
-
-    Args:
-        old: The run in `plan.json`.
-        plan: The present plan.
-        settings: The content of `settings.json`, which may be of the plan that the run is from.
-    """
-    same = next((node for node in plan.nodes if node.label == old["label"]), None)
-    if same is None:
-        return _why_label(old["label"], plan)
-    before = settings.get("runs", {}).get(old["label"], {})
-    if before.get("key") == old["key"]:
-        changed = _differences(before["settings"], same.run.model_dump(mode="json"))
-        texts = [f"{place} = {json.dumps(value)}" for place, value, _ in changed]
-        if len(texts) > MOST_SETTINGS:
-            texts[MOST_SETTINGS:] = ["..."]
-        if texts:
-            return ", ".join(texts)
-        if settings.get("algorithm") != plan.algorithm:
-            return f"version {settings.get('algorithm')} of the algorithm"
-    elif old.get("env_steps", same.run.env_steps) != same.run.env_steps:
-        return f"env_steps = {old['env_steps']}"
-    return "trained from another source"
-
-
-def _why_label(label: str, plan: Plan) -> str:
-    """The part of an earlier run's label that no run of the plan has."""
-    stage, task, *values, seed = label.split("/")
-    runs = [run for run in plan.runs if run.stage == stage]
-    is_searched = any(one.name == stage for one in plan.searched)
-    if not runs and not is_searched:
-        return f"stage = {stage}"
-    if runs and seed not in {f"seed{run.seed}" for run in runs}:
-        return f"seed = {seed.removeprefix('seed')}"
-    if runs and task not in {run.task for run in runs}:
-        return f"task = {task}"
-    if is_searched:
-        return f"other trials of {stage}"
-    return "/".join(values).replace("=", " = ").replace(",", ", ") or "other settings"
+    return [{"key": key, "label": one["label"]} for key, one in known.items() if key in gone]
 
 
 def earlier_text(location: SweepLocation) -> str | None:
@@ -195,27 +139,16 @@ def earlier_text(location: SweepLocation) -> str | None:
         return None
     store = NodeStore(location.storage)
     known = store.begun() | store.finished(one["key"] for one in recorded)
-    counts = Counter(one["why"] for one in recorded if one["key"] in known)
-    if not counts:
-        return None
-    reasons = [
-        f"{why} ({in_runs(number)})" if len(counts) > 1 else why
-        for why, number in counts.most_common(MOST_REASONS)
-    ]
-    if len(counts) > MOST_REASONS:
-        reasons.append(f"{len(counts) - MOST_REASONS} other reasons")
-    number = counts.total()
-    return (
-        f"{in_runs(number)} of an earlier version of this sweep {'is' if number == 1 else 'are'} "
-        f"not shown: {'; '.join(reasons)}."
-    )
+    number = sum(one["key"] in known for one in recorded)
+    are = "is" if number == 1 else "are"
+    text = f"{in_runs(number)} of an earlier version of this sweep {are} not shown (see {PLAN})."
+    return text if number else None
 
 
 # Changes since the last run -----------------------------------------------------------------------
 
 
-@dataclass(frozen=True, kw_only=True)
-class Changes:
+class Changes(NamedTuple):
     """Differences of a sweep from its last run."""
 
     name: str

@@ -237,7 +237,7 @@ _SOUND: dict[str, Callable[[Any], bool]] = {
     PLAN: lambda document: (
         _has(document, {"nodes"})
         and _is_list_with(document["nodes"], {"key", "label"})
-        and _is_list_with(document.get("earlier", []), {"key", "label", "why"})
+        and _is_list_with(document.get("earlier", []), {"key", "label"})
     ),
     STATE: lambda document: _has(document, _STATE_KEYS) and _has(document["driver"], _DRIVER_KEYS),
     SEARCH: _is_list_with,

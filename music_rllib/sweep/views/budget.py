@@ -78,10 +78,11 @@ def searched_runs(config: SweepConfig, stage: Stage) -> list[RunGroup]:
     search = stage.search
     if search is None:
         return []
-    studies, phases = len(search.compared()), [(search.count, len(config.seeds), None)]
+    studies = len(search.compared())
+    phases = [(search.count, len(config.seeds), stage.most_env_steps)]
     if (final := search.final) is not None:
         finalists = min(final.most(len(search.points_to_evaluate)), search.count)
-        phases.append((finalists, final.seeds, final.env_steps))
+        phases.append((finalists, final.seeds, final.env_steps or stage.most_env_steps))
     runs: Counter[tuple[str, str, int]] = Counter()
     source = config.source_of(stage)
     for fresh, (trials, seeds, env_steps) in enumerate(phases):
@@ -92,7 +93,7 @@ def searched_runs(config: SweepConfig, stage: Stage) -> list[RunGroup]:
             for task, run in source.points[0].runs.items():
                 runs[source.name, task, run.env_steps] += count * seeds
         for task in stage.points[0].runs:
-            runs[stage.name, task, env_steps or stage.most_env_steps] += trials * studies * seeds
+            runs[stage.name, task, env_steps] += trials * studies * seeds
     return [
         RunGroup(
             stage=name,

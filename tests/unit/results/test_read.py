@@ -157,7 +157,7 @@ class Shown:
 
 
 STEPS, SEEDS, VALUES = {"steps": 4000}, {"seeds": 2}, {"qs": (1.0, 1.5)}
-NOT_SHOWN = "of an earlier version of this sweep are not shown:"
+NOT_SHOWN = "of an earlier version of this sweep are not shown (see plan.json)."
 
 
 @pytest.mark.parametrize(
@@ -165,14 +165,14 @@ NOT_SHOWN = "of an earlier version of this sweep are not shown:"
     [
         ([{}], None),
         ([{"seeds": 5}], None),
-        ([STEPS], f"6 runs {NOT_SHOWN} env_steps = 2000."),
-        ([SEEDS], f"2 runs {NOT_SHOWN} seed = 2."),
-        ([VALUES], f"3 runs {NOT_SHOWN} tac.entropic_index = 2."),
+        ([STEPS], f"6 runs {NOT_SHOWN}"),
+        ([SEEDS], f"2 runs {NOT_SHOWN}"),
+        ([VALUES], f"3 runs {NOT_SHOWN}"),
         (
             [STEPS, STEPS | VALUES],
-            f"9 runs {NOT_SHOWN} env_steps = 2000 (6 runs); tac.entropic_index = 2 (3 runs).",
+            f"9 runs {NOT_SHOWN}",
         ),
-        ([STEPS, {}], f"6 runs {NOT_SHOWN} env_steps = 4000."),
+        ([STEPS, {}], f"6 runs {NOT_SHOWN}"),
     ],
     ids=["twice", "more seeds", "steps", "fewer seeds", "values", "steps and values", "back"],
 )
@@ -212,7 +212,7 @@ def test_an_interrupted_sweep_shows_runs_up_to_their_checkpoints(
     opened = play(tmp_path, steps=4000, stops_after=4)
     shown = Shown(tmp_path, capsys)
     assert {label: runs for label, (runs, _) in shown.agreed().items()} == {"q = 1": 3, "q = 2": 1}
-    assert shown.earlier() == f"6 runs {NOT_SHOWN} env_steps = 2000."
+    assert shown.earlier() == f"6 runs {NOT_SHOWN}"
     assert [run.status for run in shown.read.runs] == ["FINISHED"] * 4 + ["KILLED", "SCHEDULED"]
     steps, values = shown.read.series(4, names.EVAL_SUCCESS)
     assert (steps.tolist(), values.tolist()) == (
@@ -264,7 +264,7 @@ def test_a_changed_search_shows_the_trials_of_its_plan(tmp_path: Path) -> None:
     begun(0.15)
     changed = read_sweep(str(sweep.folder)).sweep
     assert not changed.runs
-    assert changed.earlier == f"9 runs {NOT_SHOWN} other trials of train."
+    assert changed.earlier == f"9 runs {NOT_SHOWN}"
 
 
 def test_damaged_runs_raise_or_count_as_unfinished(tmp_path: Path) -> None:
@@ -339,5 +339,4 @@ def test_runs_of_an_earlier_algorithm_are_read(
     assert {run.tags[names.TAG_ALGORITHM] for run in read.runs} == {opened.plan.algorithm}
     play(tmp_path, seeds=1)
     retrained = read_sweep(str(opened.folder)).sweep
-    version = f"version {opened.plan.algorithm} of the algorithm"
-    assert retrained.earlier == f"2 runs {NOT_SHOWN} {version}."
+    assert retrained.earlier == f"2 runs {NOT_SHOWN}"
