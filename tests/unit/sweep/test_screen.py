@@ -21,7 +21,7 @@ from music_rllib.report.figures.plots import color_of
 from music_rllib.schedules import Linear, Piecewise
 from music_rllib.store.history import Report, RunResult
 from music_rllib.store.storage import resolve_storage, sweep_folder
-from music_rllib.sweep.listeners.screen import Display, Throughput
+from music_rllib.sweep.listeners.screen import Display
 from music_rllib.sweep.views.plan import alpha_rows, plan_view
 from music_rllib.sweep.views.results import results_table
 
@@ -186,7 +186,9 @@ def play(
     for node in (good, bad):
         scheduler.start(node.key)
         display.started(node)
-    wait(10)
+    wait(5)
+    display.reported(good, [report(500, 5.0)])
+    wait(5)
     display.reported(
         good, [report(1000, 10.0, **{names.EVAL_EPISODES: 5, names.EVAL_SUCCESS: 0.2})]
     )
@@ -330,27 +332,20 @@ def test_what_a_failed_run_has_spent_stays_spent(plan: Plan) -> None:
         assert display._summary().startswith("0 of 6 runs finished, 1,000 of 24,000 env steps")
 
 
-def test_pace_is_that_of_the_last_reports() -> None:
-    throughput = Throughput(10_000, warm_up=0, now=0.0)
-    assert throughput.steps_per_second is None
-    assert throughput.seconds_left(5.0) is None
-    throughput.add([report(1000, 20.0)], now=20.0)
-    assert throughput.steps_per_second == pytest.approx(50)
-    throughput.add([report(1000 + 1000 * i, 20.0 + 10 * i) for i in range(1, 7)], now=80.0)
-    assert throughput.steps_per_second == pytest.approx(100)
-    assert throughput.env_steps == 7000
-    assert throughput.seconds_left(80.0) == pytest.approx(30)
-    assert throughput.seconds_left(85.0) == pytest.approx(25)
-    assert throughput.seconds_left(1000.0) == 0.0
-
-
-def test_random_steps_say_nothing_about_the_pace_of_learning() -> None:
-    throughput = Throughput(3000, warm_up=1000, now=0.0)
-    throughput.add([report(500, 0.5), report(1000, 1.0)], now=1.0)
-    assert throughput.steps_per_second is None
-    throughput.add([report(1500, 11.0)], now=11.0)
-    assert throughput.steps_per_second == pytest.approx(50)
-    assert throughput.seconds_left(11.0) == pytest.approx(30)
+def test_random_steps_say_nothing_about_the_pace_of_learning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("music_rllib.sweep.listeners.screen.PROGRESS_SECONDS", 0.0)
+    plan = make_plan(loaded(tmp_path, defaults={"tac": {"random_steps": 1000}}))
+    node, console = plan.nodes[-1], screen()
+    with Display(console[0], plan, Scheduler(plan, finished=()), time := Clock()) as display:
+        display.started(node)
+        for seconds, steps in ((1, 500), (1, 1000), (10, 1500), (10, 2000)):
+            time.now += seconds
+            display.reported(node, [report(steps, time.now)])
+    *early, learns = console[1].getvalue().splitlines()
+    assert not any("steps/s" in line for line in early)
+    assert "50 steps/s, 1:00 left" in learns
 
 
 @pytest.mark.parametrize(
