@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -212,6 +212,18 @@ def remove_damaged(sweep: OpenSweep, say: Callable[[str], None]) -> None:
         say(text)
 
 
+def plan_node(node: Node) -> dict[str, Any]:
+    """A node in `plan.json`."""
+    return {
+        "key": node.key,
+        "label": node.label,
+        "input": node.source_key,
+        "env_steps": node.run.env_steps,
+        "continuation": continuation_key(node.run, node.source_key),
+        **({"code": node.run.code} if node.run.own_modules else {}),
+    }
+
+
 def _labels(plan: Plan, recorded: Mapping[str, Any]) -> dict[str, str]:
     """Labels of all nodes that the sweep may reuse, by key; with those of earlier trials."""
     labels = {}
@@ -244,61 +256,53 @@ class FoundRun:
 
     key: str
     label: str
-    task: str
+    code: str
     """Its task, with the module of its intrinsic reward if that is the user's own."""
     continuation: str | None
     """Key of the last checkpoint that it shares with runs of other budgets."""
-    progress: str = ""
-    """Such as `is finished`; empty if the storage has nothing of it."""
-    environment: Fingerprint | None = None
-    differences: tuple[str, ...] = ()
+    progress: str
+    """Such as `is finished`."""
+    environment: Fingerprint | None
+    differences: tuple[str, ...]
     """Differences of its environment from the present one, such as `lab_env.py changed`."""
 
 
 def found_runs(sweep: OpenSweep) -> list[FoundRun]:
     """All runs that have a result or a checkpoint in the storage, in the order of the plan."""
-    runs = [
-        FoundRun(
-            key=node.key,
-            label=node.label,
-            task=node.run.code,
-            continuation=continuation_key(node.run, node.source_key),
-        )
-        for node in sweep.plan.nodes
-    ]
-    runs += [
-        FoundRun(
-            key=node["key"],
-            label=node["label"],
-            task=node.get("code", node["label"].split("/")[1]),
-            continuation=node.get("continuation"),
-        )
-        for node in (sweep.recorded.get("nodes", ()) if sweep.plan.searched else ())
-        if not sweep.scheduler.knows(node["key"])
-    ]
-
-    def find(run: FoundRun) -> FoundRun:
-        progress, environment = _in_storage(sweep, run)
-        changed = tuple(sweep.environments.differences(run.task, environment))
-        return replace(run, progress=progress, environment=environment, differences=changed)
-
-    return [run for run in sweep.store.map(find, runs) if run.progress]
+    nodes = [plan_node(node) for node in sweep.plan.nodes]
+    if sweep.plan.searched:  # the recorded trials, which the plan does not have yet
+        recorded = sweep.recorded.get("nodes", ())
+        nodes += [node for node in recorded if not sweep.scheduler.knows(node["key"])]
+    found = sweep.store.map(partial(_found_run, sweep), nodes)
+    return [run for run in found if run is not None]
 
 
-def _in_storage(sweep: OpenSweep, run: FoundRun) -> tuple[str, Fingerprint | None]:
-    """The progress of a run, or of a shorter run that it would continue, and its environment."""
-    store = sweep.store
-    if (progress := sweep.progress(run.key)) is not None:
-        finished = progress == FINISHED
-        return progress, (
-            store.environment(run.key) if finished else store.work_folder(run.key).environment()
-        )
-    if run.continuation is not None and sweep.scheduler.knows(run.key):
-        steps = sweep.continued_from(sweep.scheduler.node(run.key))
-        if steps is not None:
-            environment = store.continuation(run.continuation).environment()
-            return f"would continue a run of {steps:,} env steps", environment
-    return "", None
+def _found_run(sweep: OpenSweep, node: Mapping[str, Any]) -> FoundRun | None:
+    """A run of `plan.json` with its progress, or that of a shorter run that it would continue."""
+    key, continuation, store = node["key"], node.get("continuation"), sweep.store
+    progress = sweep.progress(key)
+    if progress == FINISHED:
+        environment = store.environment(key)
+    elif progress is not None:
+        environment = store.work_folder(key).environment()
+    elif sweep.scheduler.knows(key) and continuation is not None:
+        steps = sweep.continued_from(sweep.scheduler.node(key))
+        if steps is None:
+            return None
+        progress = f"would continue a run of {steps:,} env steps"
+        environment = store.continuation(continuation).environment()
+    else:
+        return None
+    code = node.get("code", node["label"].split("/")[1])
+    return FoundRun(
+        key=key,
+        label=node["label"],
+        code=code,
+        continuation=continuation,
+        progress=progress,
+        environment=environment,
+        differences=tuple(sweep.environments.differences(code, environment)),
+    )
 
 
 def changed_text(sweep: OpenSweep, runs: Iterable[FoundRun]) -> str | None:
@@ -306,7 +310,7 @@ def changed_text(sweep: OpenSweep, runs: Iterable[FoundRun]) -> str | None:
     groups: dict[tuple[str, tuple[str, ...]], list[FoundRun]] = {}
     for run in runs:
         if run.differences:
-            groups.setdefault((run.task, run.differences), []).append(run)
+            groups.setdefault((run.code, run.differences), []).append(run)
     if not groups:
         return None
     lines = []
@@ -396,7 +400,7 @@ def accept_environments(
         StorageError: The decision can't be recorded.
     """
     answers = {
-        (digest_of(run.environment), digest_of(sweep.environments.now[run.task])): run.differences
+        (digest_of(run.environment), digest_of(sweep.environments.now[run.code])): run.differences
         for run in runs
         if run.environment is not None
     }

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 
 from music_rllib.config.run_settings import RETIRED
 from music_rllib.config.schema import SweepConfig
-from music_rllib.experiment.open_sweep import FINISHED, OpenSweep
-from music_rllib.experiment.plan import Node, budget_settings, continuation_key
+from music_rllib.experiment.open_sweep import FINISHED, OpenSweep, plan_node
+from music_rllib.experiment.plan import Node, budget_settings
 from music_rllib.experiment.sweep_files import (
     CONFIG,
     IN_STORAGE,
@@ -67,21 +67,10 @@ def keep_record(sweep: OpenSweep) -> None:
 def plan_document(sweep: OpenSweep) -> dict[str, Any]:
     """The content of `plan.json`: all nodes so far, and those of earlier plans."""
     keys = {node.key for node in sweep.plan.nodes}
-    nodes = [
-        {
-            "key": node.key,
-            "label": node.label,
-            "input": node.source_key,
-            "env_steps": node.run.env_steps,
-            "continuation": continuation_key(node.run, node.source_key),
-            **({"code": node.run.code} if node.run.own_modules else {}),
-        }
-        for node in sweep.plan.nodes
-    ]
     return {
         "storage": redact(sweep.storage),
         "algorithm": sweep.plan.algorithm,
-        "nodes": nodes,
+        "nodes": [plan_node(node) for node in sweep.plan.nodes],
         "trials": sweep.plan.trials,
         "environments": {task: dict(found) for task, found in sweep.environments.now.items()},
         "earlier": [one for one in sweep.earlier if one["key"] not in keys],

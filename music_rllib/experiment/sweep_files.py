@@ -12,7 +12,7 @@ import contextlib
 import json
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Set
+from collections.abc import Mapping, Set
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -88,13 +88,6 @@ class SweepLocation:
             open_storage(str(self.folder)).write(file, text.encode())
         self.write(file, text)
 
-    def remove(self, file: str) -> None:
-        """Delete a file from the storage if it exists."""
-        try:
-            self._files.remove(file)
-        except OSError as error:
-            raise StorageError(f"{self.place}/{file} must be deletable: {error}") from error
-
     def nodes(self) -> list[dict[str, Any]]:
         """The runs in its `plan.json`; empty if it has none."""
         nodes: list[dict[str, Any]] = (self.read(PLAN) or {"nodes": []})["nodes"]
@@ -152,15 +145,9 @@ def _locate(place: str, storage: str | None) -> SweepLocation:
         config = load_config(place, storage=storage)
         return SweepLocation(storage=resolve_storage(config.storage)[0], name=config.name)
     place = place.rstrip("/")
-    if storage is None and "://" in place:
-        above, name = storage_and_name(place)
-        return SweepLocation(storage=above, name=name)
     if storage is None and "/" in place:
-        folder = Path(resolve_storage(place)[0])
-        raise BadInputError(
-            f"SWEEP must be the folder of a sweep, a sweep's name or its YAML file, got {place}: "
-            f"there is no folder {folder} (sweeps beside it: {_names(str(folder.parent))})"
-        )
+        above, name = storage_and_name(place)
+        return SweepLocation(storage=resolve_storage(above)[0], name=name)
     return SweepLocation(storage=resolve_storage(storage or "results")[0], name=place)
 
 
@@ -209,7 +196,8 @@ def read_json(folder: StorageFolder, file: str) -> Any:
         document = None if data is None else json.loads(data)
     except (OSError, ValueError) as error:
         raise StorageError(f"{place} must be a readable JSON file: {error}") from error
-    if document is not None and file in _SOUND and not _SOUND[file](document):
+    has_keys = isinstance(document, dict) and document.keys() >= _KEYS.get(file, set())
+    if document is not None and file in _KEYS and not has_keys:
         raise StorageError(
             f"{place} must be a sweep's {file.removesuffix('.json')} as its driver writes it, got "
             f"{shown(document)}; running the sweep again replaces it"
@@ -217,29 +205,9 @@ def read_json(folder: StorageFolder, file: str) -> Any:
     return document
 
 
-def _has(document: Any, keys: Set[str]) -> bool:
-    return isinstance(document, dict) and document.keys() >= keys
-
-
-def _is_list_with(document: Any, keys: Set[str] = frozenset()) -> bool:
-    return isinstance(document, list) and all(_has(item, keys) for item in document)
-
-
-_STATE_KEYS = {"sweep", "driver", "stages", "env_steps", "running", "best", "searches", "failures"}
-_DRIVER_KEYS = {"pid", "host", "machine", "process_started"} | {
-    "started",
-    "heartbeat",
-    "ended",
-    "outcome",
+_KEYS: dict[str, Set[str]] = {
+    CONFIG: {"stages"},
+    PLAN: {"nodes"},
+    STATE: {"sweep", "driver", "stages", "env_steps", "running", "best", "searches", "failures"},
 }
-_SOUND: dict[str, Callable[[Any], bool]] = {
-    CONFIG: lambda document: _has(document, {"stages"}) and _is_list_with(document["stages"]),
-    PLAN: lambda document: (
-        _has(document, {"nodes"})
-        and _is_list_with(document["nodes"], {"key", "label"})
-        and _is_list_with(document.get("earlier", []), {"key", "label"})
-    ),
-    STATE: lambda document: _has(document, _STATE_KEYS) and _has(document["driver"], _DRIVER_KEYS),
-    SEARCH: _is_list_with,
-}
-"""File name to a check that its content has the keys that are read from it."""
+"""File name to the keys that are read from it."""

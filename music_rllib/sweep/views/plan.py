@@ -16,9 +16,8 @@ from music_rllib.config.schema import Source, Stage, SweepConfig
 from music_rllib.config.search import SearchSettings
 from music_rllib.config.space import Choice, Dimension
 from music_rllib.envs.tasks import Task
-from music_rllib.experiment.open_sweep import OpenSweep
+from music_rllib.experiment.open_sweep import OpenSweep, plan_node
 from music_rllib.experiment.plan import Plan, shared_runs, short
-from music_rllib.experiment.record import plan_document
 from music_rllib.names import in_runs
 from music_rllib.redaction import redact
 
@@ -172,9 +171,7 @@ def plan_answer(opened: OpenSweep, changes: str) -> dict[str, Any]:
         if stage.search is not None
     ]
     finished = opened.finished
-    nodes = [
-        node | {"finished": node["key"] in finished} for node in plan_document(opened)["nodes"]
-    ]
+    nodes = [plan_node(node) | {"finished": node.key in finished} for node in plan.nodes]
     return {
         "sweep": config.name,
         "storage": redact(opened.storage),

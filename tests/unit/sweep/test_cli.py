@@ -406,4 +406,4 @@ def test_resume_needs_a_sweep(program: Program, tmp_path: Path) -> None:
 def test_a_folder_that_is_not_there(program: Program, tmp_path: Path) -> None:
     result = program(None, "status", str(tmp_path / "empty"))
     assert result.exit_code == 2
-    assert f"got {tmp_path}/empty: there is no folder {tmp_path}/empty (" in result.stderr
+    assert f"got {tmp_path}/empty: there is no {tmp_path}/empty/config.json (" in result.stderr
