@@ -1,9 +1,10 @@
-"""The cost of a plan on this machine, from some seconds of training for each group of runs."""
+"""Groups of runs that take equally long, and their cost on this machine, measured."""
 
 from __future__ import annotations
 
 import math
 import os
+from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -11,15 +12,122 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Group
 
 from music_rllib.command_line import clock, new_table
-from music_rllib.config.schema import SweepConfig
+from music_rllib.config.run_settings import RunSettings
+from music_rllib.config.schema import Stage, SweepConfig
+from music_rllib.config.search import SearchSettings
+from music_rllib.experiment.plan import Node, Plan
 from music_rllib.runtime import machine
-from music_rllib.sweep.views.budget import RunGroup
 
 if TYPE_CHECKING:
     from music_rllib.training.sample_run import RunSample
 
 BUSY_LOAD = 0.75
 """Load average per CPU above which other programs have disturbed the measurement."""
+
+
+_WITHOUT_COST: dict[str, bool | set[str]] = {
+    "seed": True,
+    "env_steps": True,
+    "tac": {"entropic_index", "alpha", "gamma", "tau", "lr", "target_bounds"}
+    | {"random_steps", "random_actions", "warmup_steps"},
+    "music": {"mi_reward_weight", "lr"},
+    "intrinsic": {"weight", "lr"},
+}
+"""Settings that do not change how long a step takes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunGroup:
+    """Runs of one stage and task that take equally long."""
+
+    stage: str
+    runs: int
+    """Runs left to train; at most, for a search."""
+    settings: RunSettings
+    env_steps: int
+    """Environment steps of one run, on average."""
+
+    @property
+    def label(self) -> str:
+        """`stage/task`."""
+        return f"{self.stage}/{self.settings.task.name}"
+
+    @property
+    def all_env_steps(self) -> int:
+        """Environment steps of all runs together."""
+        return self.runs * self.env_steps
+
+    @property
+    def grad_updates(self) -> int:
+        """Gradient updates of one run."""
+        learning = self.env_steps - self.settings.tac.steps_before_updates
+        return round(learning * self.settings.tac.replay_ratio)
+
+
+def run_groups(config: SweepConfig, plan: Plan, finished: Collection[str]) -> list[RunGroup]:
+    """Groups of the runs that are left: those of the plan in its order, then those of searches."""
+    groups: dict[str, list[Node]] = {}
+    for node in plan.nodes:
+        if node.key not in finished:
+            alike = node.run.model_dump_json(exclude=dict(_WITHOUT_COST))
+            groups.setdefault(f"{node.stage} {alike}", []).append(node)
+    planned = [
+        RunGroup(
+            stage=group[0].stage,
+            runs=len(group),
+            settings=group[0].run,
+            env_steps=round(sum(node.run.env_steps for node in group) / len(group)),
+        )
+        for group in groups.values()
+    ]
+    return planned + [group for stage in config.stages for group in searched_runs(config, stage)]
+
+
+def searched_runs(config: SweepConfig, stage: Stage) -> list[RunGroup]:
+    """The runs that the search of a stage trains at most, and the runs that these start from.
+
+    Trials may stop early, and points repeat.
+    """
+    search = stage.search
+    if search is None:
+        return []
+    studies = len(search.compared())
+    phases = [(search.count, len(config.seeds), stage.most_env_steps)]
+    if (final := search.final) is not None:
+        finalists = min(final.most(len(search.points_to_evaluate)), search.count)
+        phases.append((finalists, final.seeds, final.env_steps or stage.most_env_steps))
+    runs: Counter[tuple[str, str, int]] = Counter()
+    source = config.source_of(stage)
+    for fresh, (trials, seeds, env_steps) in enumerate(phases):
+        if source is not None:
+            points = _points_of(search, source.name)
+            # A source whose settings are not searched has its other runs in the plan.
+            count = min(trials * studies, points) if fresh or points > 1 else 0
+            for task, run in source.points[0].runs.items():
+                runs[source.name, task, run.env_steps] += count * seeds
+        for task in stage.points[0].runs:
+            runs[stage.name, task, env_steps] += trials * studies * seeds
+    return [
+        RunGroup(
+            stage=name,
+            runs=number,
+            settings=config.stage(name).points[0].runs[task],
+            env_steps=env_steps,
+        )
+        for (name, task, env_steps), number in runs.items()
+        if number
+    ]
+
+
+def _points_of(search: SearchSettings, stage: str) -> int:
+    """The largest number of points that a search has in the settings of another stage."""
+    names = [name for name in (*search.space, *search.compare) if name.startswith(f"{stage}:")]
+    return math.prod(
+        len(search.compare[name])
+        if name in search.compare
+        else search.space[name].size or search.count
+        for name in names
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,11 +150,6 @@ def measure(
     config: SweepConfig, groups: Collection[RunGroup], say: Callable[[str], None]
 ) -> tuple[list[Cost], int]:
     """Train runs of each group for some seconds, as many side by side as fit.
-
-    Args:
-        config: Has the resources of a run.
-        groups: Groups of runs, as `run_groups` returns them.
-        say: Receives a line before each measurement.
 
     Returns:
         The cost of each group, and how many runs fit at once.
@@ -120,9 +223,7 @@ def cost_view(costs: Sequence[Cost], slots: int) -> Group:
 def _memory_text(largest: int, slots: int) -> str:
     """The memory of runs side by side, and how to run fewer of them if it is too much.
 
-    Args:
-        largest: Bytes of the largest run.
-        slots: Runs at a time.
+    `largest` is the memory of the largest run in bytes, `slots` the number of runs at a time.
     """
     gib = largest / 2**30
     if machine.cluster_address() is not None:

@@ -274,9 +274,8 @@ def _record_analysis_plan(console: Console, opened: OpenSweep) -> list[dict[str,
 def _measure(console: Console, opened: OpenSweep) -> dict[str, Any]:
     """Measure and show the cost of the runs that are left; the cost as plain data."""
     from music_rllib.sweep import cost
-    from music_rllib.sweep.views.budget import run_groups
 
-    left = run_groups(opened.config, opened.plan, opened.finished)
+    left = cost.run_groups(opened.config, opened.plan, opened.finished)
     costs, slots = cost.measure(opened.config, left, console.print)
     console.print(cost.cost_view(costs, slots))
     return cost.cost_document(costs, slots)

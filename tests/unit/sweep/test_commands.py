@@ -519,7 +519,7 @@ def test_clean_keeps_a_last_checkpoint_that_another_sweep_shares(
     (kept,) = going["kept"]
     assert kept["what"] == f"last checkpoint of {node.label}: long has it too"
     assert len(last.names()) == 1
-    (longer.folder / "plan.json").unlink()
+    longer.location._files.remove("plan.json")
     assert program("clean", f"{storage}/mine", "--yes").code == 0
     assert not last.names()
 

@@ -10,7 +10,7 @@ from music_rllib.config.load import load_config
 from music_rllib.experiment.plan import make_plan
 from music_rllib.runtime import machine
 from music_rllib.sweep import cost
-from music_rllib.sweep.views.budget import RunGroup, run_groups
+from music_rllib.sweep.cost import RunGroup, run_groups
 from music_rllib.training.sample_run import RunSample
 
 
