@@ -32,13 +32,8 @@ def check_search(
 ) -> None:
     """Check a stage's `search` and the stage that its runs start from.
 
-    Args:
-        stage: The stage.
-        search: Its search.
-        earlier: The stages above this one by name; None for an invalid one.
-        seeds: Number of the sweep's seeds; 0 if they are invalid.
-        resolve_at: Gives the stage's settings at a point.
-        findings: Takes the problems; its path is the stage's.
+    `earlier` and `findings` are as in `resolve_stage`. `seeds` is the number of the sweep's seeds,
+    0 if they are invalid. `resolve_at` gives the stage's settings at a point.
     """
     problems_before = len(findings.problems)
     in_search = findings.below("search")

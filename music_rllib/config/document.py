@@ -187,12 +187,7 @@ def shipped_presets() -> dict[str, str]:
 
 
 def read_preset(name: Any, folder: Path, place: Place) -> YamlFile:
-    """Read a preset by its name, or by its path if `name` ends in `.yaml`.
-
-    Args:
-        name: The value of `preset`.
-        folder: The folder of the sweep's file.
-        place: The place of `name`, for messages.
+    """Read a preset by its name, or by its path from `folder` if `name` ends in `.yaml`.
 
     Raises:
         ConfigError: There is no such preset, or it can't be read.

@@ -140,12 +140,8 @@ def open_sweep(
 ) -> OpenSweep:
     """Open the storage, and find the runs in it that are finished and undamaged.
 
-    Args:
-        config: The sweep.
-        plan: Its plan.
-        storage: Absolute folder, or URI.
-        environments: Fingerprints of its tasks' environments, if the sweep is to be run.
-        lenient: Accept damaged runs, which wait for `remove_damaged`.
+    A sweep that is to be run needs the fingerprints of its `environments`. `lenient` accepts
+    damaged runs, which wait for `remove_damaged`.
 
     Raises:
         StorageError: The storage can't be reached, or finished runs in it are damaged.
@@ -190,11 +186,7 @@ def open_started(location: SweepLocation, *, lenient: bool = False) -> OpenSweep
     """Open a sweep with its plan as of its last run, and its finished runs.
 
     The plan includes the searched trials. Its keys are of the version of the algorithm that the
-    sweep was run with.
-
-    Args:
-        location: The sweep.
-        lenient: Accept damaged runs, which then count as not finished.
+    sweep was run with. `lenient` accepts damaged runs, which then count as not finished.
     """
     recorded = location.read(PLAN) or {}
     settings = {} if "algorithm" in recorded else location.read(SETTINGS) or {}
@@ -335,12 +327,8 @@ def decide(
 ) -> tuple[list[FoundRun], list[FoundRun]]:
     """The runs to retrain (with those that start from them), and the changed runs to keep.
 
-    Args:
-        sweep: The sweep.
-        runs: Its runs in the storage.
-        retrain: Names of `--retrain`.
-        all_changed: Retrain all runs of different environments.
-        keep: Keep the runs of different environments that are not retrained.
+    `retrain` are the names of `--retrain`; `all_changed` retrains all runs of different
+    environments, and `keep` keeps those that are not retrained.
 
     Raises:
         BadInputError: A name fits no run, or no option decides about a changed environment.

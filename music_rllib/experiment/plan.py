@@ -145,11 +145,9 @@ class Plan:
         return self._nodes[key]
 
     def add_stage(self, stage: Stage, *, with_runs: bool) -> None:
-        """Add a stage; its source, if that is a stage, must be in the plan already.
+        """Add a stage, `with_runs` of its grid; its source stage must be in the plan already.
 
-        Args:
-            stage: The stage; `add_trial` adds the runs of a searched stage.
-            with_runs: Add the runs of the grid, if the stage has no search.
+        `add_trial` adds the runs of a searched stage.
         """
         self._stages[stage.name] = stage
         if stage.search is not None or not with_runs:

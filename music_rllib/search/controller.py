@@ -45,14 +45,10 @@ class SearchController(Listener):
         pruned: Callable[[Node, str], None] = lambda node, reason: None,
         say: Callable[[str], None] = lambda text: None,
     ) -> None:
-        """Control the searches of `sweep`.
+        """Control the searches of `sweep`, whose plan and scheduler grow.
 
-        Args:
-            sweep: Its plan and scheduler grow.
-            searches: The opened searches.
-            reused: Called with each requested node that is already in the store.
-            pruned: Called with each node that is not computed any further, and the reason.
-            say: Called with one line about the end of each trial.
+        `reused` is called with each requested node that is already in the store, `pruned` with each
+        node that is not computed any further and the reason, `say` with a line at each trial's end.
         """
         self.searches = list(searches)
         self._scheduler, self._plan, self._store = sweep.scheduler, sweep.plan, sweep.store

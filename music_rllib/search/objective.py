@@ -82,10 +82,7 @@ def aggregate(objective: Objective, scores: Array) -> float:
 def interval(objective: Objective, scores: Array, episodes: int | None = None) -> Estimate:
     """The value of a trial with its 95% interval; the ends are NaN for a single run.
 
-    Args:
-        objective: The objective.
-        scores: `[seeds, tasks]`.
-        episodes: Episodes of one evaluation, if they are known.
+    `episodes` is the number of episodes of one evaluation, if it is known.
     """
     is_rate = objective.metric in names.EVAL_RATES and objective.read != "steps_to"
     if objective.aggregate == "worst_task":

@@ -98,9 +98,7 @@ def check_studies(sweep: OpenSweep) -> None:
 def open_searches(sweep: OpenSweep, *, alone: bool = False) -> list[Search]:
     """Open the studies of a sweep's searched stages; missing studies are created.
 
-    Args:
-        sweep: The sweep.
-        alone: No other driver runs it.
+    `alone` says that no other driver runs the sweep.
 
     Raises:
         StorageError: A study's storage can't be used.

@@ -65,15 +65,9 @@ class OptunaStudy:
         compared: Mapping[str, Any],
         alone: bool,
     ) -> None:
-        """Open the study, which is created if it does not exist.
+        """Open the study as in `find_or_create`.
 
-        Args:
-            storage: Its storage.
-            base: Name of its search, `sweep/stage`.
-            settings: Settings of its search.
-            determined_by: Plain data of everything else that determines its values.
-            compared: Its compared values; empty in `search` mode.
-            alone: No other driver is running now: running trials belong to a dead one.
+        `alone` says that no other driver is running now: running trials belong to a dead one.
         """
         self.settings = settings
         self.compared = dict(compared)

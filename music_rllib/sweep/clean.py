@@ -69,10 +69,8 @@ class Cleaning:
 def find_deletable(location: SweepLocation, *, unfinished: bool, everything: bool) -> Cleaning:
     """Folders that can be deleted, with the reason.
 
-    Args:
-        location: The sweep.
-        unfinished: Include checkpoints of interrupted runs.
-        everything: Include results and the sweep's own files.
+    `unfinished` includes checkpoints of interrupted runs, `everything` results and the sweep's own
+    files.
 
     Raises:
         BadInputError: The sweep is running, or another running sweep shares runs with it.

@@ -68,15 +68,7 @@ def load(
 ) -> SweepConfig:
     """The sweep of a file, or the packaged one, with the settings of the command line.
 
-    Args:
-        path: The sweep's file; None: the packaged one.
-        name: Replaces the file's `name`.
-        storage: Replaces the file's `storage`.
-        seeds: Replaces `seeds`: a number, or a list with commas.
-        overrides: `KEY=VALUE` each; they replace settings of the file.
-
-    Raises:
-        ConfigError: The file or an override is wrong.
+    The arguments are those of `load_config`.
     """
     path = path or DEFAULT_CONFIG
     search_in(path.parent)
@@ -84,15 +76,7 @@ def load(
 
 
 def plan(config: SweepConfig, *, measure: bool = False, as_json: bool = False) -> int:
-    """Check a sweep and show its runs; train nothing.
-
-    Args:
-        config: As `load` returns it.
-        measure: Train each group of runs for some seconds and estimate the whole time.
-        as_json: Print one JSON document on standard output.
-
-    Returns:
-        The exit code.
+    """Check a sweep and show its runs; train nothing. Returns the exit code.
 
     Raises:
         BadInputError: The sweep can't be run as it is.
@@ -128,20 +112,9 @@ def run(
     wait_minutes: float | None = None,
     as_json: bool = False,
 ) -> int:
-    """Train the runs of a sweep, compare them, and log them to MLflow.
+    """Train the runs of a sweep, compare them, and log them to MLflow. Returns the exit code.
 
-    Args:
-        config: As `load` returns it.
-        accept_changes: Retrain runs whose settings or environment have changed since the last run
-            of this sweep.
-        retrain: Tasks or labels of runs whose results are deleted and which are trained again.
-        keep_runs: Use runs whose environment has changed.
-        retrain_damaged: Delete damaged finished runs and train them again.
-        wait_minutes: Time to wait for nodes of a cluster; by default only if it has no CPUs.
-        as_json: Print the sweep's last `state.json` on standard output.
-
-    Returns:
-        The exit code.
+    The options are those of `music-rllib run`.
 
     Raises:
         BadInputError: Nothing was started; as other errors that name what to change.
@@ -200,14 +173,8 @@ def _open(
 ) -> tuple[OpenSweep, Capacity | None]:
     """Check what can be checked without starting anything, and show the plan.
 
-    Args:
-        console: Shows the plan.
-        config: The sweep's configuration.
-        lenient: Whether finished runs may be damaged.
-        wait_minutes: Time to wait for nodes of a cluster.
-
-    Returns:
-        The sweep, and the room of the cluster that is to train it.
+    `lenient` accepts damaged runs. Returns the sweep, and the room of the cluster that is to train
+    it.
     """
     config = _with_environment(console, config)
     if config.path == DEFAULT_CONFIG:

@@ -25,10 +25,7 @@ WAIT_SECONDS = 1.0
 def drivers_of(storage: str, name: str, *, watch: bool = False) -> list[Lease]:
     """The leases of the processes that drive a sweep.
 
-    Args:
-        storage: Folder or URI.
-        name: The sweep's name.
-        watch: Look for up to a minute at leases that a fast clock has dated ahead.
+    `watch` looks for up to a minute at leases that a fast clock has dated ahead.
     """
     folder = open_storage(storage) / name / DRIVERS
     files = [LeaseFile(folder, file) for file in folder.files() if not file.startswith(".")]

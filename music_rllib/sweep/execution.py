@@ -75,13 +75,8 @@ def compute_and_report(
 ) -> int:
     """Compute what is left, show the results and write the report; the exit code.
 
-    Args:
-        console: Shows progress and results.
-        opened: The sweep.
-        tracker: As `open_tracker` returns it.
-        plans: The recorded versions of its analysis plan, as plain data.
-        drivers: The sweep's drivers.
-        shares: Whether another driver runs the sweep already.
+    `plans` are the recorded versions of the analysis plan as plain data, `shares` says whether
+    another driver runs the sweep already.
     """
     if plans:
         tracker.put_sweep_artifact(names.ARTIFACT_ANALYSIS_PLAN, as_json(plans))
@@ -270,12 +265,7 @@ def report_at_end(storage: str, name: str, tracking_uri: str | None, config: Pat
     """Make the report of a sweep and attach it to the sweep's run in MLflow.
 
     It runs in a process of its own: whatever happens in it, the results of the sweep are kept.
-
-    Args:
-        storage: Folder or URI of a bucket.
-        name: The sweep's name.
-        tracking_uri: MLflow's, password included; None for the file in the storage.
-        config: The sweep's YAML file, whose environments are recorded in videos.
+    `config` is the sweep's YAML file, whose environments are recorded in videos.
 
     Returns:
         A message with the paths of the page and its picture, or with the reason why there is no
@@ -318,12 +308,7 @@ def report_at_end(storage: str, name: str, tracking_uri: str | None, config: Pat
 
 
 def elsewhere(output: str, sweep: str) -> list[str]:
-    """Lines about a report that the user may read on another machine than this one.
-
-    Args:
-        output: The output of the report's process.
-        sweep: The sweep's folder or URI.
-    """
+    """Lines of the report's `output` for a user who may read it on another machine."""
     lines = [line for line in output.splitlines() if re.match("Attached .*: https?:", line)]
     for line in output.splitlines():
         if line.startswith("Report: "):

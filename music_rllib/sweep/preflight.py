@@ -53,12 +53,8 @@ class TaskError(BadInputError, ValueError):
 def check_environments(plan: Plan, hang_minutes: float | None = None) -> list[str]:
     """Play each declared environment in a child process, and check that its task describes it.
 
-    Args:
-        plan: The sweep's plan.
-        hang_minutes: Maximum duration of one call of an environment; None: no limit.
-
-    Returns:
-        Remarks, one line each.
+    One call of an environment may take `hang_minutes`; None: no limit. Returns remarks, one line
+    each.
 
     Raises:
         TaskError: A task does not fit; with one line per problem, and the remarks.
@@ -213,11 +209,6 @@ def find_cluster(
 ) -> Capacity | None:
     """Connect to the cluster, and show its room for runs, unless everything is computed.
 
-    Args:
-        console: Shows the cluster, and that the sweep waits for nodes.
-        opened: The sweep.
-        wait_minutes: Time to wait for nodes, as in `cluster`.
-
     Raises:
         ClusterError: It does not answer, or cannot hold a run.
     """
@@ -245,11 +236,9 @@ class DemandError(BadInputError, ValueError):
 
 
 def check_demand(sweep: OpenSweep, node_memory: float | None = None) -> None:
-    """Check that each unfinished run fits into memory.
+    """Check that each unfinished run fits into the memory of this machine, or of a cluster's nodes.
 
-    Args:
-        sweep: The sweep.
-        node_memory: Bytes of the largest node of a cluster; None: this machine's memory counts.
+    `node_memory` is that of the largest node in bytes.
 
     Raises:
         DemandError: A run does not fit.

@@ -30,11 +30,7 @@ SECTION = "comparison"
 def comparison_view(plan: Plan, stage: Stage, sweep_id: str, now: float) -> str:
     """The view of a stage: a line per condition, its primary metric first.
 
-    Args:
-        plan: The sweep's plan.
-        stage: The stage to compare.
-        sweep_id: The value of its runs' tag `sweep_id`.
-        now: Seconds since the epoch.
+    `sweep_id` is the value of its runs' tag of this name, `now` is in seconds since the epoch.
     """
     runs = [node.run for node in plan.nodes]
     tasks = list({run.task.name: run.task for run in runs}.values())

@@ -72,14 +72,9 @@ class PrometheusListener(Listener):
         folder: Path,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Export the gauges of a sweep.
+        """Export the gauges of a sweep; the addresses for Prometheus are written beside `folder`.
 
-        Args:
-            sweep: Its name.
-            scheduler: Has the statuses of its nodes.
-            pending: Returns the records that MLflow has not received yet.
-            folder: Folder of the sweep; the addresses for Prometheus are written beside it.
-            now: A clock in seconds.
+        `pending` returns the records that MLflow has not received yet, `now` is a clock in seconds.
         """
         self._sweep = sweep
         self._scheduler = scheduler

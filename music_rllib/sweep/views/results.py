@@ -29,12 +29,9 @@ _STATES = {Status.STARTED: "interrupted", Status.WAITING: "not started"}
 def results_table(
     plan: Plan, status: Callable[[str], Status], results: Mapping[str, RunResult]
 ) -> Table:
-    """One row for each run: its last metrics and its state.
+    """One row for each run: its last metrics, of its result or its progress so far, and its state.
 
-    Args:
-        plan: The sweep's plan.
-        status: Node key to the status of the node.
-        results: Node key to the result, or to the progress of an unfinished run.
+    `status` and `results` are by node key.
     """
     metrics = _metric_columns({node.run.task.primary_metric for node in plan.nodes})
     shown = {
