@@ -14,7 +14,7 @@ from music_rllib.envs.fingerprint import Fingerprint, differences, digest_of
 from music_rllib.errors import BadInputError
 from music_rllib.experiment.plan import Node, Plan, budget_settings, continuation_key, make_plan
 from music_rllib.experiment.scheduler import DONE, Scheduler
-from music_rllib.experiment.sweep_files import PLAN, SETTINGS, SweepLocation, as_json, read_json
+from music_rllib.experiment.sweep_files import PLAN, SweepLocation, as_json, read_json
 from music_rllib.names import ShortLabels, in_runs, label_matches
 from music_rllib.store.history import RunResult
 from music_rllib.store.node_store import CONTINUATIONS, NodeStore, damage_in_words
@@ -189,9 +189,8 @@ def open_started(location: SweepLocation, *, lenient: bool = False) -> OpenSweep
     sweep was run with. `lenient` accepts damaged runs, which then count as not finished.
     """
     recorded = location.read(PLAN) or {}
-    settings = {} if "algorithm" in recorded else location.read(SETTINGS) or {}
     config = location.config()
-    plan = make_plan(config, algorithm=(recorded | settings).get("algorithm"))
+    plan = make_plan(config, algorithm=recorded.get("algorithm"))
     for trial in recorded.get("trials", ()):
         plan.add_trial(**trial)
     return open_sweep(config, plan, location.storage, lenient=lenient)

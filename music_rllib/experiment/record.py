@@ -1,4 +1,4 @@
-"""The record of a sweep's configuration, plan and settings, and changes since it was written.
+"""The record of a sweep's configuration and plan, and changes since it was written.
 
 A run that the plan no longer has stays in the storage. `plan.json` keeps its key as one of an
 earlier version of the sweep, so that it can be named; nothing compares it. A later plan that has
@@ -10,18 +10,18 @@ from __future__ import annotations
 import contextlib
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
-from music_rllib.config.run_settings import RETIRED
+from music_rllib.config.run_settings import RETIRED, RunSettings
 from music_rllib.config.schema import SweepConfig
+from music_rllib.errors import BadInputError
 from music_rllib.experiment.open_sweep import FINISHED, OpenSweep, plan_node
-from music_rllib.experiment.plan import Node, budget_settings
+from music_rllib.experiment.plan import Node, budget_settings, make_plan
 from music_rllib.experiment.sweep_files import (
     CONFIG,
     IN_STORAGE,
     PLAN,
-    SETTINGS,
     SweepLocation,
     as_json,
 )
@@ -38,7 +38,7 @@ SHOWN = 10
 
 
 def keep_record(sweep: OpenSweep) -> None:
-    """Write the configuration, the plan and the runs' settings into the sweep's folder.
+    """Write the configuration and the plan into the sweep's folder.
 
     Raises:
         StorageError: The folder can't be written.
@@ -52,16 +52,6 @@ def keep_record(sweep: OpenSweep) -> None:
     keeps_trials = unchanged is not None and sweep.plan.searched and not sweep.plan.trials
     if not keeps_trials:  # else the record has trials that the plan does not have yet
         location.keep(PLAN, as_json(plan_document(sweep)))
-    runs = {
-        node.label: {
-            "key": node.key,
-            "settings": node.run.model_dump(mode="json"),
-            "source": node.source_key,
-        }
-        for node in sweep.plan.nodes
-    }
-    settings = {"algorithm": sweep.plan.algorithm, "runs": runs, "searched": _searched(sweep)}
-    location.keep(SETTINGS, json.dumps(settings, indent=1))
 
 
 def plan_document(sweep: OpenSweep) -> dict[str, Any]:
@@ -96,18 +86,6 @@ def _unchanged_plan(sweep: OpenSweep, configuration: str) -> dict[str, Any] | No
         if same and plan and plan.get("algorithm") == sweep.plan.algorithm and "earlier" in plan:
             return plan
     return None
-
-
-def _searched(sweep: OpenSweep) -> dict[str, dict[str, Any]]:
-    """Settings by stage and task that no search chooses, of stages with trials only."""
-    planned = {node.stage for node in sweep.plan.nodes if not node.part}
-    return {
-        stage.name: {
-            task: run.model_dump(mode="json") for task, run in stage.points[0].runs.items()
-        }
-        for stage in sweep.config.stages
-        if stage.name not in planned
-    }
 
 
 # Runs of earlier versions -------------------------------------------------------------------------
@@ -169,86 +147,88 @@ def changes_since(sweep: OpenSweep) -> Changes | None:
     """Results of the sweep's last run that this one does not use; None if there are none.
 
     Runs that are new, or that the plan no longer has, do not count.
-
-    Raises:
-        StorageError: The record of the last run can't be read.
     """
-    try:
-        before = sweep.location.read(SETTINGS)
-        runs: Mapping[str, Any] = before["runs"]
-        algorithm = before["algorithm"]
-    except (KeyError, TypeError):
-        return None  # the first run of the sweep
+    recorded = {node["label"]: node for node in sweep.recorded.get("nodes", ())}
     keys = {node.key for node in sweep.plan.nodes}
+    nodes = [node for node in sweep.plan.nodes if node.label in recorded]
+    changed = [node for node in nodes if recorded[node.label]["key"] not in keys]
+    if not recorded or not (changed or sweep.plan.searched):
+        return None
+    before = _last_configuration(sweep)
+    runs = {} if before is None else {node.label: node.run for node in make_plan(before).nodes}
     counts: Counter[str] = Counter()
-    lost = []
-    changed_stages = []
-    short = sweep.short
-    for node in sweep.plan.nodes:
-        old = runs.get(node.label)
-        if old is None or old["key"] in keys:
-            continue
-        lines = list(_changed_settings(old["settings"], node.run.model_dump(mode="json")))
+    lost, short = [], sweep.short
+    for node in changed:
+        old = recorded[node.label]
+        lines = list(_changed_settings(runs[node.label], node.run)) if node.label in runs else []
         is_longer = (
             len(lines) == 1
-            and old["source"] == node.source_key
-            and old["settings"]["env_steps"] < node.run.env_steps
+            and old["input"] == node.source_key
+            and old["env_steps"] < node.run.env_steps
         )
         if is_longer and sweep.continued_from(node) is not None:
             continue
         counts.update(lines)
-        changed_stages.append(node.stage)
         if (progress := sweep.progress(old["key"])) is not None:
             why = _why_not_continued(node) if is_longer and progress == FINISHED else ""
             lost.append(f"{short(node.label)}: {progress}{why}")
-    for stage, changed in _changed_searches(sweep, before.get("searched", {}), changed_stages):
-        for old in sweep.recorded.get("nodes", ()):
-            if not old["label"].startswith(f"{stage}/") or old["key"] in keys:
+    for stage, lines in _changed_searches(sweep, before, [node.stage for node in changed]):
+        for label, old in recorded.items():
+            if not label.startswith(f"{stage}/") or old["key"] in keys:
                 continue
             if (progress := sweep.progress(old["key"])) is not None:
-                counts.update(list(changed))  # its keys: a mapping would add its values
-                lost.append(f"{old['label']}: {progress}")
+                counts.update(lines)
+                lost.append(f"{label}: {progress}")
     if not lost:
         return None
-    lines = [f"{line} ({in_runs(count)})" for line, count in counts.items()]
+    differences = [f"{line} ({in_runs(count)})" for line, count in counts.items()]
+    algorithm = sweep.recorded.get("algorithm")
     if algorithm != sweep.plan.algorithm:
-        lines.append(f"version of the algorithm: {algorithm} -> {sweep.plan.algorithm}")
+        differences.append(f"version of the algorithm: {algorithm} -> {sweep.plan.algorithm}")
     return Changes(
         name=sweep.plan.name,
-        differences=tuple(lines or ["the runs that it starts from"]),
+        differences=tuple(differences or ["the runs that it starts from"]),
         lost=tuple(lost),
     )
 
 
+def _last_configuration(sweep: OpenSweep) -> SweepConfig | None:
+    """The configuration of the sweep's last run; None if this version cannot read it."""
+    with contextlib.suppress(BadInputError):
+        return sweep.location.config()
+    return None
+
+
 def _changed_searches(
-    sweep: OpenSweep, before: Mapping[str, Any], planned: Iterable[str]
-) -> Iterator[tuple[str, dict[str, None]]]:
+    sweep: OpenSweep, before: SweepConfig | None, changed: Iterable[str]
+) -> Iterator[tuple[str, list[str]]]:
     """Searched stages with changed settings, and the lines of the changes, each once.
 
     A setting that a search chooses or compares may be new in its space: that makes new trials.
-    `planned` are the stages whose other runs have changed.
+    `changed` are the stages whose other runs have changed.
     """
     chosen = [
         name if ":" in name else f"{stage.name}:{name}"
-        for stage in sweep.config.stages
+        for stage in sweep.plan.searched
         if stage.search is not None
         for name in (*stage.search.space, *stage.search.compare)
     ]
-    now = _searched(sweep)
-    changed = [*planned]
+    planned = {node.stage for node in sweep.plan.nodes if not node.part}
+    earlier = {stage.name: stage.points[0].runs for stage in before.stages} if before else {}
+    all_changed = {*changed}
     for stage in sweep.config.stages:
-        after, earlier = now.get(stage.name), before.get(stage.name)
-        if after is None or earlier is None:
+        if stage.name in planned or stage.name not in earlier:
             continue
-        lines = {
-            line: None
-            for task in after.keys() & earlier.keys()
-            for line in _changed_settings(earlier[task], after[task])
+        lines = [
+            line
+            for task, run in stage.points[0].runs.items()
+            if task in earlier[stage.name]
+            for line in _changed_settings(earlier[stage.name][task], run)
             if not any(f"{stage.name}:{line}".startswith((f"{one}:", f"{one}.")) for one in chosen)
-        }
-        if lines or stage.source_stage in changed:
-            changed.append(stage.name)
-            yield stage.name, lines
+        ]
+        if lines or stage.source_stage in all_changed:
+            all_changed.add(stage.name)
+            yield stage.name, list(dict.fromkeys(lines))
 
 
 def continued_runs_text(sweep: OpenSweep) -> list[str]:
@@ -274,8 +254,9 @@ def _why_not_continued(node: Node) -> str:
     )
 
 
-def _changed_settings(before: Any, after: Any) -> Iterator[str]:
-    for place, old, new in _differences(before, after):
+def _changed_settings(before: RunSettings, after: RunSettings) -> Iterator[str]:
+    dumps = before.model_dump(mode="json"), after.model_dump(mode="json")
+    for place, old, new in _differences(*dumps):
         if tuple(place.split(".")) not in RETIRED:
             yield f"{place}: {json.dumps(old)} -> {json.dumps(new)}"
 

@@ -1,9 +1,8 @@
 """A started sweep: how commands find it, and its small files below `<storage>/<name>`.
 
 `config.json` is the whole configuration, `plan.json` its runs and those of earlier plans,
-`settings.json` their settings, `search.json` the results of its searches, `state.json` its
-progress, `analysis_plan.json` the versions of its analysis plan. In a bucket, other machines read
-them there; this machine has a copy.
+`search.json` the results of its searches, `state.json` its progress, `analysis_plan.json` the
+versions of its analysis plan. In a bucket, other machines read them there; this machine has a copy.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ from music_rllib.store.storage import (
 )
 
 CONFIG, PLAN, SEARCH, STATE = "config.json", "plan.json", "search.json", "state.json"
-ANALYSIS_PLAN, SETTINGS = "analysis_plan.json", "settings.json"
+ANALYSIS_PLAN = "analysis_plan.json"
 IN_STORAGE = "storage:"
 """Prefix of a handoff's key in `config.json`: the folder that the user gave may have changed."""
 STOP = "stop.json"

@@ -203,7 +203,7 @@ def test_a_refused_sweep_is_not_recorded(
     result = program(bad)
     assert (result.exit_code, message in result.stderr) == (2, True), result.stderr
     left = [path.name for path in (tmp_path / "results").rglob("*") if path.is_file()]
-    assert not {*left} & {"config.json", "plan.json", "settings.json", "state.json"}
+    assert not {*left} & {"config.json", "plan.json", "state.json"}
     assert not list(tmp_path.rglob("*.db"))
 
 
