@@ -28,7 +28,7 @@ from music_rllib.config.run_settings import LAYER_KEYS
 from music_rllib.config.schema import Header, Stage, SweepConfig
 from music_rllib.config.search import FINAL_SEED
 from music_rllib.config.stages import resolve_stage
-from music_rllib.envs.tasks import BUILT_IN_TASKS, Task, TaskRegistry, UnknownTaskError, search_in
+from music_rllib.envs.tasks import BUILT_IN_TASKS, Task, closest, search_in
 from music_rllib.limits import MOST_RUNS, MOST_SEEDS
 from music_rllib.store.storage import expanded
 
@@ -143,15 +143,13 @@ def _resolve(document: Document, findings: Findings) -> SweepConfig | None:
         findings.add(("defaults", key), unknown(key, all_settings()))
 
     def find_tasks(names: Iterable[str], findings: Findings) -> tuple[Task, ...]:
-        tasks = []
         for position, name in enumerate(names):
-            try:
-                tasks.append(registry[name])
-            except UnknownTaskError as error:
-                # An invalid declaration is a problem already, and its name is known.
-                if name not in _mapping(data.get("environments")):
-                    findings.add((position,), str(error))
-        return tuple(tasks)
+            # An invalid declaration is a problem already, and its name is known.
+            if name not in {**registry, **_mapping(data.get("environments"))}:
+                known = ", ".join(registry)
+                rule = f"must be a known task ({known}), got {name!r}{closest(name, registry)}"
+                findings.add((position,), rule)
+        return tuple(registry[name] for name in names if name in registry)
 
     names = [name for name in _list(data.get("tasks")) if isinstance(name, str)]
     sweep_tasks = find_tasks(names, findings.below("tasks"))
@@ -214,8 +212,9 @@ def _header(data: dict[str, Any], findings: Findings) -> Header | None:
     return findings.validate(Header, values)
 
 
-def _registry(data: dict[str, Any], findings: Findings) -> TaskRegistry:
-    tasks = []
+def _registry(data: dict[str, Any], findings: Findings) -> dict[str, Task]:
+    """The built-in tasks and those of the sweep, by name."""
+    tasks = dict(BUILT_IN_TASKS)
     for name, raw in _mapping(data.get("environments")).items():
         path = ("environments", name)
         if name in BUILT_IN_TASKS:
@@ -225,8 +224,8 @@ def _registry(data: dict[str, Any], findings: Findings) -> TaskRegistry:
         elif isinstance(raw, dict) and (
             task := findings.below(*path).validate(Task, raw | {"name": name})
         ):
-            tasks.append(task)
-    return TaskRegistry(tasks)
+            tasks[name] = task
+    return tasks
 
 
 def _count_runs(stages: Mapping[str, Stage | None], seeds: int, findings: Findings) -> None:

@@ -233,27 +233,6 @@ BUILT_IN_TASKS: Mapping[str, Task] = MappingProxyType(
 """Tasks of Gymnasium-Robotics, and PointCarry; tests compare each with its environment."""
 
 
-class UnknownTaskError(LookupError):
-    """A task name that is neither built in nor declared; the message suggests a similar one."""
-
-
-class TaskRegistry(dict[str, Task]):
-    """The built-in tasks and a user's tasks, by name."""
-
-    def __init__(self, user_tasks: Iterable[Task] = ()) -> None:
-        super().__init__(BUILT_IN_TASKS)
-        for task in user_tasks:
-            if task.name in self:
-                kind = "a built-in task" if task.name in BUILT_IN_TASKS else "declared twice"
-                raise ValueError(f"{task.name} is {kind}; choose another name")
-            self[task.name] = task
-
-    def __missing__(self, name: str) -> Task:
-        raise UnknownTaskError(
-            f"must be a known task ({', '.join(self)}), got {name!r}{closest(name, self)}"
-        )
-
-
 def closest(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:
     """`" (did you mean 'FetchPush'?)"`, or an empty string if no known name is similar."""
     by_folded = {candidate.casefold(): candidate for candidate in known}

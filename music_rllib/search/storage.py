@@ -66,11 +66,6 @@ def check_database(url: str) -> None:
             engine.dispose()
 
 
-def studies_of(storage: BaseStorage) -> list[Any]:
-    """All studies in a storage, the oldest first."""
-    return sorted(storage.get_all_studies(), key=lambda study: int(study._study_id))
-
-
 @contextlib.contextmanager
 def _checked(url: str) -> Iterator[URL]:
     """The parsed URL; errors of the database become errors that name the setting.

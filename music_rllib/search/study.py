@@ -12,7 +12,6 @@ are in the store, so only new runs are trained.
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import socket
 import time
@@ -26,10 +25,10 @@ from optuna.exceptions import DuplicatedStudyError, UpdateFinishedTrialError
 from optuna.storages import BaseStorage
 from optuna.trial import FrozenTrial, TrialState, create_trial
 
+from music_rllib.config.problems import same
 from music_rllib.config.search import SearchSettings
 from music_rllib.experiment.plan import short
 from music_rllib.search.sampler import VALUES, Proposer, directions_of
-from music_rllib.search.storage import studies_of
 from music_rllib.store.serialization import content_key
 
 # Attributes of a study.
@@ -354,16 +353,12 @@ def _earlier_points(
     """Points of the newest study with the same base and other settings that are in the space."""
     older = [
         study._study_id
-        for study in studies_of(storage)
+        for study in storage.get_all_studies()
         if study.user_attrs.get(BASE) == base and study.study_name != name
     ]
     if settings.sampler == "grid" or not older:
         return []
-    given = [json.dumps(point, sort_keys=True) for point in settings.points_to_evaluate]
-    trials = storage.get_all_trials(older[-1], deepcopy=False)
+    trials = storage.get_all_trials(max(older), deepcopy=False)
     points = [trial.user_attrs.get(VALUES) for trial in trials if trial.state.is_finished()]
-    return [
-        point
-        for point in points
-        if point and fits(point, settings) and json.dumps(point, sort_keys=True) not in given
-    ]
+    given = settings.points_to_evaluate
+    return [p for p in points if p and fits(p, settings) and not any(same(p, g) for g in given)]
