@@ -205,7 +205,8 @@ def best_text(best: Mapping[str, Any]) -> str:
     if runs < planned:
         text += f"{runs} of {planned} runs (no condition has all of its runs yet)"
     else:
-        text += f"{in_runs(runs)}{' on fresh seeds' if best['on_fresh_seeds'] else ''}"
+        selected = " that selected it" if "trial" in best else ""
+        text += in_runs(runs) + (" on fresh seeds" if best["on_fresh_seeds"] else selected)
     entropy = best.get("entropies", {}).get(names.SHANNON_ENTROPY)
     # Conditions with the same value differ in their entropies.
     return text if entropy is None or level else f"{text}, entropy {entropy['value']:.3g} nats"

@@ -19,13 +19,11 @@ from music_rllib.experiment import sweep_files
 from music_rllib.experiment.open_sweep import OpenSweep, open_started
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.sweep_files import SweepLocation
-from music_rllib.names import in_runs
 from music_rllib.redaction import redact
 from music_rllib.results.conditions import Condition
 from music_rllib.results.data import LastValues, RunRecord, Sweep
 from music_rllib.results.read import searches_of
-from music_rllib.results.statistics import with_interval
-from music_rllib.search.best import best_so_far, condition_of, ranking_metric
+from music_rllib.search.best import best_so_far, best_text, condition_of, ranking_metric
 from music_rllib.store.storage import StorageError, is_remote, write_atomically
 
 CHOSEN = "chosen.json"
@@ -60,16 +58,6 @@ def export_best(location: SweepLocation, stage_name: str | None, output: Path) -
     why = (f"{row['task']}: {one['why']}" for row, one in zip(rows, exported, strict=True))
     policies = [policy for one in exported for policy in one["policies"]]
     return exported[0] | {"why": "\n".join(why), "policies": policies}
-
-
-def entropies_text(entropies: Mapping[str, Mapping[str, Any]]) -> str | None:
-    """The entropies of an exported condition in a line; None if they are unknown."""
-    words = {names.SHANNON_ENTROPY: "Shannon entropy (nats)", names.ENTROPY: "S_q"}
-    texts = [
-        f"{words[metric]} {with_interval(entropy['value'], entropy['interval'])}"
-        for metric, entropy in entropies.items()
-    ]
-    return f"its policies at the end: {', '.join(texts)}" if texts else None
 
 
 def _best(
@@ -117,7 +105,7 @@ def _export_condition(
         "success_rate": None if success is None else float(success.estimate.value),
         "entropies": best.get("entropies", {}),
         "on_fresh_seeds": best["on_fresh_seeds"],
-        "why": _reason(stage, best, scored.condition),
+        "why": best_text(best),
     }
     policies = []
     tasks = list(dict.fromkeys(sweep.runs[run].task for run in scored.condition.runs))
@@ -137,20 +125,6 @@ def _export_condition(
         policies.append(policy)
         _export(opened, run.node_key, folder, chosen | policy)
     return chosen | {"policies": policies}
-
-
-def _reason(stage: Stage, best: Mapping[str, Any], condition: Condition) -> str:
-    by, level = best["by"], best["level"]
-    rank = f"ties for first with {level} more" if level else "is first"
-    seeds = "fresh seeds" if best["on_fresh_seeds"] else "the seeds that selected it"
-    text = (
-        f"{stage.name}: {condition.short_label} {rank} by {by} on {seeds}; {by} "
-        f"({'' if stage.search else 'mean, '}95% CI): "
-        f"{with_interval(best['value'], best['interval'])} over {in_runs(best['runs'])}"
-    )
-    if best["runs"] == best["planned"]:
-        return text
-    return f"{text}, of {best['planned']} planned: no condition has all of its runs"
 
 
 def _median_run(sweep: Sweep, condition: Condition, task: str, metric: str) -> RunRecord | None:

@@ -73,7 +73,7 @@ def best(
     """
     from music_rllib.experiment.record import earlier_text
     from music_rllib.experiment.sweep_files import find_sweep
-    from music_rllib.sweep.export import entropies_text, export_best
+    from music_rllib.sweep.export import export_best
 
     found = find_sweep(sweep, storage)
     folder = output or found.folder / "best"
@@ -82,7 +82,7 @@ def best(
         print_json(chosen)
         return 0
     console = console_for()
-    lines = [chosen["why"], entropies_text(chosen["entropies"]), earlier_text(found)]
+    lines = [chosen["why"], earlier_text(found)]
     lines += [f"{policy['task']}: {policy['folder']}" for policy in chosen["policies"]]
     for line in filter(None, lines):
         console.print(line, soft_wrap=True)

@@ -423,7 +423,7 @@ def test_best_and_status_rank_as_the_search_does(
     assert best["value"] == pytest.approx(0.21)
     chosen = answered(capsys, "best", place, "--output", str(tmp_path / "out"))
     assert chosen["values"] == {"tac.entropic_index": 1.0}
-    said = "finetune: q = 1 is first by iqm of evaluation/success_rate (minimize)"
+    said = "finetune q = 1: iqm of evaluation/success_rate (minimize) 0.21"
     assert chosen["why"].startswith(said)
     compared = answered(capsys, "compare", place)
     assert compared["direction"] == "minimize"

@@ -143,7 +143,7 @@ class Shown:
         means = zip(rows["condition"], rows["runs"], rows["mean"], strict=True)
         assert {label: (runs, mean) for label, runs, mean in means} == found
         first = max(found, key=lambda label: found[label][1])
-        assert f"train: {first} is first" in self.best["why"]
+        assert f"train {first}" in self.best["why"]
         return found
 
     def earlier(self) -> str | None:
