@@ -337,12 +337,8 @@ def register_robotics() -> None:
 
 
 def drop_farama_notice() -> None:
-    """Remove the notice about the Adroit hand, which `gymnasium_robotics` prints on import."""
-    try:
-        import farama_notifications as farama
-    except ImportError:
-        return
-    notice = getattr(farama, "GYMNASIUM_ROBOTICS_ADROIT_WARNING", None)
-    versions = farama.notifications.get("gymnasium_robotics", {})
-    for version in [version for version, text in versions.items() if text == notice]:
-        del versions[version]
+    """Remove the notices that `gymnasium_robotics` prints on import."""
+    with contextlib.suppress(ImportError):
+        import farama_notifications
+
+        farama_notifications.notifications.pop("gymnasium_robotics", None)

@@ -31,10 +31,8 @@ from music_rllib.experiment.plan import short
 from music_rllib.search.sampler import VALUES, Proposer, directions_of
 from music_rllib.store.serialization import content_key
 
-# Attributes of a study.
-BASE, COMPARED = "music_rllib:base", "music_rllib:arm"
-SETTINGS, POINTS = "music_rllib:settings", "music_rllib:points"
-"""Points of the first trials; it is set last, when all other attributes are there."""
+POINTS = "music_rllib:points"
+"""Attribute of a study: the points of its first trials, which stay if older studies change."""
 
 CREATION_SECONDS = 10.0
 """Longest wait for another driver that creates the study."""
@@ -301,31 +299,22 @@ def find_or_create(
     base = "/".join((base, *(f"{name}={short(value, name)}" for name, value in compared.items())))
     name = f"{base} @{content_key([own, {**determined_by, 'arm': dict(compared)}])}"
 
-    def attributes() -> dict[str, Any]:
-        """Attributes of a new study, which stay the same if older studies change."""
-        earlier = _earlier_points(storage, settings, base, name)
-        return {
-            BASE: base,
-            COMPARED: dict(compared),
-            SETTINGS: own,
-            POINTS: [*settings.points_to_evaluate, *earlier],
-        }
-
     try:
         study = storage.get_study_id_from_name(name)
     except KeyError:
-        found = attributes()  # before another driver sees the study
+        points = _first_points(storage, settings, base)  # before another driver sees the study
         try:
             study = storage.create_new_study(directions_of(settings), study_name=name)
         except DuplicatedStudyError:
             study = storage.get_study_id_from_name(name)
         else:
-            _set_attributes(storage, study, found)
+            storage.set_study_user_attr(study, POINTS, points)
             return study, name
     patience = time.monotonic() + CREATION_SECONDS
     while POINTS not in storage.get_study_user_attrs(study):
         if time.monotonic() > patience:  # its creator died before any search used it
-            _set_attributes(storage, study, attributes())
+            points = _first_points(storage, settings, base)
+            storage.set_study_user_attr(study, POINTS, points)
         time.sleep(0.1)
     return study, name
 
@@ -342,23 +331,19 @@ def fits(values: Mapping[str, Any], settings: SearchSettings) -> bool:
     return len(seen) == len(values)
 
 
-def _set_attributes(storage: BaseStorage, study: int, attributes: Mapping[str, Any]) -> None:
-    for key, value in attributes.items():
-        storage.set_study_user_attr(study, key, value)
-
-
-def _earlier_points(
-    storage: BaseStorage, settings: SearchSettings, base: str, name: str
+def _first_points(
+    storage: BaseStorage, settings: SearchSettings, base: str
 ) -> list[dict[str, Any]]:
-    """Points of the newest study with the same base and other settings that are in the space."""
+    """The given points, and those of the newest study with the same base and other settings."""
+    given = list(settings.points_to_evaluate)
     older = [
         study._study_id
         for study in storage.get_all_studies()
-        if study.user_attrs.get(BASE) == base and study.study_name != name
+        if study.study_name.rpartition(" @")[0] == base and POINTS in study.user_attrs
     ]
     if settings.sampler == "grid" or not older:
-        return []
+        return given
     trials = storage.get_all_trials(max(older), deepcopy=False)
-    points = [trial.user_attrs.get(VALUES) for trial in trials if trial.state.is_finished()]
-    given = settings.points_to_evaluate
-    return [p for p in points if p and fits(p, settings) and not any(same(p, g) for g in given)]
+    earlier = [trial.user_attrs.get(VALUES) for trial in trials if trial.state.is_finished()]
+    fitting = [point for point in earlier if point and fits(point, settings)]
+    return given + [point for point in fitting if not any(same(point, one) for one in given)]
