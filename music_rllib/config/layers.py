@@ -19,7 +19,6 @@ from music_rllib.config.run_settings import (
     Variant,
     variant_intrinsic,
     variant_music,
-    without_retired,
 )
 from music_rllib.envs.tasks import Task
 
@@ -160,7 +159,6 @@ def merge(
             problems.append(Problem(once, unknown(dotted, known)))
         else:
             layers.put(tuple(dotted.split(".")), value, place)
-    layers.data = without_retired(layers.data)
     return layers, problems
 
 

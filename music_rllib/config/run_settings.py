@@ -134,20 +134,6 @@ YOUNGER: tuple[tuple[str, str], ...] = (
 )  # fmt: skip
 """Group and name of settings that are newer than the node keys of finished runs."""
 
-RETIRED: Mapping[tuple[str, str], Any] = MappingProxyType({("tac", "precision"): "float32"})
-"""Group and name of removed settings, with the only value that a sweep's file can still give them.
-Node keys contain them, so that finished runs are found."""
-
-
-def without_retired(settings: Any) -> Any:
-    """A run's settings as plain data, without removed settings that have their last value."""
-    for (section, name), kept in RETIRED.items():
-        group = settings.get(section) if isinstance(settings, dict) else None
-        if isinstance(group, dict) and group.get(name) == kept:
-            others = {key: value for key, value in group.items() if key != name}
-            settings = settings | {section: others}
-    return settings
-
 
 class ReplaySettings(StrictModel):
     """Size of the replay, and hindsight relabeling (Andrychowicz et al. 2017)."""
@@ -278,14 +264,12 @@ class RunSettings(StrictModel):
         """Everything that determines the numbers, as plain data.
 
         Settings of `YOUNGER` are omitted if they have their default, and `intrinsic` without a
-        reward: runs that do not use them keep the identity that they had before. Removed settings
-        keep their last value.
+        reward: runs that do not use them keep the identity that they had before.
         """
         settings = self.model_dump(mode="json") | {"task": self.task.identity()}
         if self.replay.hindsight_episodes == "moved" and self.task.moved_distance is not None:
             settings["task"]["moved_distance"] = self.task.moved_distance
-        for (section, name), kept in RETIRED.items():
-            settings[section][name] = kept
+        settings["tac"]["precision"] = "float32"  # a removed setting
         if self.intrinsic.reward is None:
             del settings["intrinsic"]
         for section, name in YOUNGER:

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
-from music_rllib.config.run_settings import RETIRED, RunSettings
+from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.schema import SweepConfig
 from music_rllib.errors import BadInputError
 from music_rllib.experiment.open_sweep import FINISHED, OpenSweep, plan_node
@@ -257,8 +257,7 @@ def _why_not_continued(node: Node) -> str:
 def _changed_settings(before: RunSettings, after: RunSettings) -> Iterator[str]:
     dumps = before.model_dump(mode="json"), after.model_dump(mode="json")
     for place, old, new in _differences(*dumps):
-        if tuple(place.split(".")) not in RETIRED:
-            yield f"{place}: {json.dumps(old)} -> {json.dumps(new)}"
+        yield f"{place}: {json.dumps(old)} -> {json.dumps(new)}"
 
 
 def _differences(before: Any, after: Any, place: str = "") -> Iterator[tuple[str, Any, Any]]:

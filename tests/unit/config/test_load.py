@@ -72,17 +72,6 @@ def run_of(config: SweepConfig, stage: int = 0, point: int = 0) -> RunSettings:
     return next(iter(config.stages[stage].points[point].runs.values()))
 
 
-def test_a_removed_setting_is_accepted_only_with_its_last_value(
-    load: Callable[..., SweepConfig], problems: Callable[[Document], list[str]]
-) -> None:
-    def given(precision: str) -> Document:
-        return changed(defaults=SOUND["defaults"] | {"tac": {"lr": 0.002, "precision": precision}})
-
-    assert run_of(load(given("float32"))) == run_of(load(SOUND))
-    (line,) = problems(given("bf16"))
-    assert line.endswith("defaults.tac.precision is not a known setting")
-
-
 def test_a_valid_file_is_resolved(load: Callable[..., SweepConfig]) -> None:
     config = load(SOUND)
     assert (config.name, config.seeds, config.storage) == ("sound", (3, 5), "results")
