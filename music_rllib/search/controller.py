@@ -19,8 +19,7 @@ from music_rllib.redaction import redact
 from music_rllib.results.statistics import Array
 from music_rllib.search.objective import aggregate, reason_to_prune, score, up_to
 from music_rllib.search.sampler import VALUES
-from music_rllib.search.searches import Finalist, RunningTrial, Search
-from music_rllib.search.storage import DATABASE_ERRORS
+from music_rllib.search.searches import DATABASE_ERRORS, Finalist, RunningTrial, Search
 from music_rllib.search.study import SCORES, OptunaStudy
 from music_rllib.store.history import Report, RunResult
 from music_rllib.store.storage import DamagedError

@@ -14,8 +14,7 @@ from music_rllib.results.statistics import improvement
 from music_rllib.search.controller import SearchController
 from music_rllib.search.objective import aggregate, interval
 from music_rllib.search.sampler import VALUES
-from music_rllib.search.searches import Finalist, Search
-from music_rllib.search.storage import DATABASE_ERRORS
+from music_rllib.search.searches import DATABASE_ERRORS, Finalist, Search
 from music_rllib.search.study import LOST, REASON, SCORES, OptunaStudy
 
 IMPORTANCE_TRIALS = 4

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from music_rllib.search import storage
+from music_rllib.search import searches
 from tests.faults import comparison, sweeps
 from tests.integration.conftest import Program
 from tests.played_search import Driver, document, searched
@@ -31,12 +31,12 @@ def locked(file: Path) -> Iterator[None]:
 def test_a_locked_study_prints_a_warning_and_is_waited_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    options = storage._engine_options
+    options = searches._engine_options
 
     def impatient(url: Any) -> dict[str, Any]:
         return options(url) | {"connect_args": {"timeout": 0.1}}
 
-    monkeypatch.setattr(storage, "_engine_options", impatient)
+    monkeypatch.setattr(searches, "_engine_options", impatient)
     for folder in ("whole", "locked"):
         (tmp_path / folder).mkdir()
     whole = searched(tmp_path / "whole")

@@ -12,9 +12,9 @@ from rich.text import Text
 from music_rllib import names
 from music_rllib.command_line import clock, new_table
 from music_rllib.config.load import warnings_of
+from music_rllib.config.problems import shown
 from music_rllib.config.schema import Source, Stage, SweepConfig
 from music_rllib.config.search import SearchSettings
-from music_rllib.config.space import Choice, Dimension
 from music_rllib.envs.tasks import Task
 from music_rllib.experiment.open_sweep import OpenSweep, plan_node
 from music_rllib.experiment.plan import Plan, shared_runs, short
@@ -128,17 +128,10 @@ def _grid_settings(stage: Stage) -> list[str]:
 def _searched_settings(search: SearchSettings) -> Iterator[str]:
     yield f"searched by {search.sampler}:"
     for name, dimension in search.space.items():
-        yield f"{name}: {_dimension_text(name, dimension)}"
+        kept = dimension.model_dump(mode="json", by_alias=True, exclude_defaults=True)
+        yield f"{name}: {shown(kept)}"
     for name, values in search.compare.items():
         yield f"{name}: {', '.join(short(value, name) for value in values)} ({search.mode})"
-
-
-def _dimension_text(name: str, dimension: Dimension) -> str:
-    if isinstance(dimension, Choice):
-        return ", ".join(short(value, name) for value in dimension.choice)
-    low, high = dimension.bounds
-    step = "" if dimension.step in (None, 1) else f" by {dimension.step:g}"
-    return f"{low:g} to {high:g}{step}{' (log)' if dimension.log else ''}"
 
 
 def _summary(plan: Plan, finished: Collection[str]) -> str:
