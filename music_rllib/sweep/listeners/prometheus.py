@@ -17,7 +17,7 @@ from music_rllib import names
 from music_rllib.config.tac_settings import setting_text
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.scheduler import Failure, Listener, Scheduler, Status
-from music_rllib.store.history import Report, RunResult
+from music_rllib.store.history import Report, RunResult, last_values
 from music_rllib.store.storage import write_atomically
 from music_rllib.tracking.sender import Pending
 
@@ -42,10 +42,6 @@ _METRICS = {
     "music_env_steps": names.ENV_STEPS,
     "music_grad_updates": names.GRAD_UPDATES,
 }
-_RATES = {
-    "music_env_steps_per_second": names.ENV_STEPS,
-    "music_grad_updates_per_second": names.GRAD_UPDATES,
-}
 GAUGES = {
     "music_success_rate": "Success rate of a run at the last step of evaluation episodes.",
     "music_success_rate_any_step": "Success rate of a run at any step of evaluation episodes.",
@@ -53,8 +49,6 @@ GAUGES = {
     "music_mutual_information_bound_nats": "Bound on the mutual information of a run, in nats.",
     "music_env_steps": "Environment steps of a run so far.",
     "music_grad_updates": "Gradient updates of a run so far.",
-    "music_env_steps_per_second": "Environment steps per second of a run; 0 after its end.",
-    "music_grad_updates_per_second": "Gradient updates per second of a run; 0 after its end.",
     "music_runs": "Runs of a sweep by their state.",
     "music_undelivered_records": "Records that MLflow has not received yet.",
 }
@@ -85,24 +79,14 @@ class PrometheusListener(Listener):
         self._gauges: dict[str, Any] = {}
         self._values: dict[str, tuple[dict[str, str], dict[str, float]]] = {}
         """Node key to tags and values by gauge."""
-        self._last_report: dict[str, Report] = {}
         self._ended: dict[str, None] = {}
         """Keys of ended nodes, in the order of their ends."""
 
     def reported(self, node: Node, reports: list[Report]) -> None:
         self._ended.pop(node.key, None)
         _, values = self._values.setdefault(node.key, (self._tags(node), {}))
-        for report in reports:
-            for gauge, metric in _METRICS.items():
-                if metric in report.metrics:
-                    values[gauge] = report.metrics[metric]
-            before = self._last_report.get(node.key)
-            if before is not None and report.seconds > before.seconds:
-                for gauge, metric in _RATES.items():
-                    if metric in report.metrics and metric in before.metrics:
-                        done = report.metrics[metric] - before.metrics[metric]
-                        values[gauge] = done / (report.seconds - before.seconds)
-            self._last_report[node.key] = report
+        last = last_values(reports)
+        values |= {gauge: last[metric] for gauge, metric in _METRICS.items() if metric in last}
 
     def finished(self, node: Node, result: RunResult) -> None:
         self._end(node)
@@ -127,10 +111,8 @@ class PrometheusListener(Listener):
             self._targets.unlink(missing_ok=True)
 
     def _end(self, node: Node) -> None:
-        """Keep the last values of a run that does not train, with rates of 0."""
-        _, values = self._values.setdefault(node.key, (self._tags(node), {}))
-        values.update(dict.fromkeys(_RATES, 0.0))
-        self._last_report.pop(node.key, None)
+        """Keep the last values of a run that does not train."""
+        self._values.setdefault(node.key, (self._tags(node), {}))
         self._ended[node.key] = None
         while len(self._ended) > KEPT:
             oldest = next(iter(self._ended))

@@ -48,8 +48,7 @@ def variables() -> list[tuple[str, str]]:
 
 def test_the_dashboard_shows_every_gauge_and_no_other() -> None:
     shown = {name for query in queries().values() for name in re.findall(r"ray_(\w+)", query)}
-    # The number of updates is exported for other dashboards.
-    assert shown | {"music_grad_updates"} == set(GAUGES)
+    assert shown == set(GAUGES)
     assert len(variables()) == 3
 
 
