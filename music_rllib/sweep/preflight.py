@@ -9,7 +9,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterable
 from functools import partial
 from itertools import pairwise
@@ -41,8 +40,6 @@ if TYPE_CHECKING:
 
 _TIMEOUT = "Timeout ("
 """Beginning of the stack that `faulthandler` writes if a call takes too long."""
-_SLACK = 10.0
-"""Seconds that the child process has to end itself if a call takes too long."""
 _HUMAN = "env_kwargs: {render_mode: human} needs a display; leave it out for training"
 
 
@@ -126,13 +123,13 @@ def _play(
                 env=os.environ | {"PYTHONPATH": path},
             )
         try:
-            hangs = not _ends(process, answers, seconds)
+            process.wait()
         finally:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)  # with the processes of the environments
             process.wait()
         lines = [json.loads(line) for line in answers.read_text().split("\n")[:-1]]
-        text = _TIMEOUT if hangs else errors.read_text(errors="replace")[-(1 << 16) :]
+        text = errors.read_text(errors="replace")[-(1 << 16) :]
     done = [(name, *found) for kind, name, *found in lines if kind == "done"]
     if len(done) < len(questions):
         name = questions[len(done)].task.name
@@ -141,19 +138,6 @@ def _play(
             (name, [_why_it_ended(process.returncode, (calls or ["import"])[-1], text)], [])
         )
     return done
-
-
-def _ends(process: subprocess.Popen[bytes], answers: Path, seconds: float | None) -> bool:
-    """Wait for the child; False if a call takes too long and the child does not end itself."""
-    while True:
-        try:
-            process.wait(timeout=0.2)
-        except subprocess.TimeoutExpired:
-            silent = time.time() - answers.stat().st_mtime
-            if seconds is not None and silent > seconds + _SLACK:
-                return False
-        else:
-            return True
 
 
 def _why_it_ended(code: int, call: str, errors: str) -> str:
