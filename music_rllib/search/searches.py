@@ -102,7 +102,7 @@ def check_studies(sweep: OpenSweep) -> None:
     """
     for stage in sweep.plan.searched:
         assert stage.search is not None
-        storage = _storage(sweep, stage.search)
+        storage = _place(sweep, stage.search)
         # The sweep's folder may not exist yet.
         if stage.search.storage or Path(storage).exists():
             check_database(storage)
@@ -119,7 +119,8 @@ def open_searches(sweep: OpenSweep, *, alone: bool = False) -> list[Search]:
     return [_open_search(sweep, stage, alone) for stage in sweep.plan.searched]
 
 
-def _storage(sweep: OpenSweep, settings: SearchSettings) -> str:
+def _place(sweep: OpenSweep, settings: SearchSettings) -> str:
+    """The database of a search: a URL, or the path of a file."""
     own = Path(os.environ.get(names.VARIABLE_STUDIES) or sweep.folder)
     return settings.storage or str(own / STUDY_FILE)
 
@@ -128,7 +129,7 @@ def _open_search(sweep: OpenSweep, stage: Stage, alone: bool) -> Search:
     settings = stage.search
     assert settings is not None
     sweep.folder.mkdir(parents=True, exist_ok=True)
-    storage, determined_by = open_studies(_storage(sweep, settings)), _determined_by(sweep, stage)
+    storage, determined_by = open_studies(_place(sweep, settings)), _determined_by(sweep, stage)
     studies = [
         OptunaStudy(
             storage,
