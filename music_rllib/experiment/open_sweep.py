@@ -220,9 +220,7 @@ def _labels(plan: Plan, recorded: Mapping[str, Any]) -> dict[str, str]:
     labels = {}
     if plan.searched:
         labels = {node["key"]: node["label"] for node in recorded.get("nodes", ())}
-    for source in plan.imports:
-        if source.checkpoint:
-            labels[source.key] = f"handoff {source.checkpoint.folder}"
+    labels |= {handoff.key: f"handoff {handoff.folder}" for handoff in plan.imports}
     short = ShortLabels.of(node.label for node in plan.nodes)
     return labels | {node.key: short(node.label) for node in plan.nodes}
 

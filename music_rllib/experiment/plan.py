@@ -122,14 +122,11 @@ class Plan:
         return sum(node.run.env_steps for node in self._nodes.values())
 
     @property
-    def imports(self) -> tuple[Input, ...]:
+    def imports(self) -> tuple[ImportedHandoff, ...]:
         """Handoffs from outside that runs start from, each once."""
-        inputs = [
-            self._input(stage.source, 0, stage.tasks[0], 0)[0]
-            for stage in self._stages.values()
-            if stage.source and stage.source.checkpoint
-        ]
-        return tuple({one.key: one for one in inputs if one}.values())
+        sources = [stage.source for stage in self._stages.values() if stage.source]
+        found = [source.checkpoint for source in sources if source.checkpoint]
+        return tuple({handoff.key: handoff for handoff in found}.values())
 
     @property
     def settings(self) -> list[RunSettings]:

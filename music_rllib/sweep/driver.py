@@ -60,16 +60,19 @@ VARIABLE = "MLFLOW_TRACKING_URI"
 
 def load(
     path: Path | None,
+    overrides: Sequence[str] | None = None,
     *,
     name: str | None = None,
     storage: str | None = None,
     seeds: str | None = None,
-    overrides: Sequence[str] = (),
 ) -> SweepConfig:
     """The sweep of a file, or the packaged one, with the settings of the command line.
 
-    The arguments are those of `load_config`.
+    A `path` with a `=` that is not a file is an override. Other arguments are as in `load_config`.
     """
+    overrides = list(overrides or ())
+    if path is not None and "=" in str(path) and not path.exists():
+        path, overrides = None, [str(path), *overrides]
     path = path or DEFAULT_CONFIG
     search_in(path.parent)
     return load_config(path, name=name, storage=storage, seeds=seeds, overrides=overrides)

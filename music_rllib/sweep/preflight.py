@@ -166,18 +166,17 @@ def import_checkpoints(plan: Plan, store: NodeStore) -> None:
         HandoffError: One is damaged.
         StorageError: The store can't be written.
     """
-    for source in plan.imports:
-        if store.is_finished(source.key):
+    for handoff in plan.imports:
+        if store.is_finished(handoff.key):
             continue
-        assert source.checkpoint is not None
-        folder, manifest = open_handoff(source.checkpoint.folder)
+        folder, manifest = open_handoff(handoff.folder)
         read_handoff(folder, list(manifest.modules), manifest.info.task)
         with TemporaryDirectory() as temporary:
             target = Path(temporary, "handoff")
             target.mkdir()
             for file in ("handoff.json", *(module.file for module in manifest.modules.values())):
                 shutil.copyfile(folder / file, target / file)
-            store.publish(source.key, Path(temporary))
+            store.publish(handoff.key, Path(temporary))
 
 
 def check_searches(opened: OpenSweep) -> None:

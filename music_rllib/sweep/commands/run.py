@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from music_rllib.command_line import Json
 from music_rllib.sweep.commands import Place, Storage
-
-if TYPE_CHECKING:
-    from music_rllib.config.schema import SweepConfig
 
 RUN_EXAMPLES = """\
 Examples:
@@ -147,7 +144,7 @@ def run(
     from music_rllib.sweep import driver
 
     return driver.run(
-        load(config, overrides, storage, name, seeds),
+        driver.load(config, overrides, storage=storage, name=name, seeds=seeds),
         accept_changes=accept_changes,
         retrain=retrain or (),
         keep_runs=keep_runs,
@@ -179,7 +176,7 @@ def plan(
     """
     from music_rllib.sweep import driver
 
-    sweep = load(config, overrides, storage, name, seeds)
+    sweep = driver.load(config, overrides, storage=storage, name=name, seeds=seeds)
     return driver.plan(sweep, measure=measure, as_json=json)
 
 
@@ -207,23 +204,3 @@ def resume(
         wait_minutes=wait_for_nodes,
         as_json=json,
     )
-
-
-def load(
-    config: Path | None,
-    overrides: list[str] | None,
-    storage: str | None,
-    name: str | None,
-    seeds: str | None,
-) -> SweepConfig:
-    """The sweep; a first argument with a `=` that is not a file is an override.
-
-    Raises:
-        ConfigError: The file or an override is wrong.
-    """
-    from music_rllib.sweep import driver
-
-    overrides = overrides or []
-    if config is not None and "=" in str(config) and not config.exists():
-        config, overrides = None, [str(config), *overrides]
-    return driver.load(config, name=name, storage=storage, seeds=seeds, overrides=overrides)

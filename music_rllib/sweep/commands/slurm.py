@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from music_rllib.errors import BadInputError
-from music_rllib.sweep.commands.run import Name, Overrides, Seeds, SweepStorage, load
+from music_rllib.sweep.commands.run import Name, Overrides, Seeds, SweepStorage
 
 EXAMPLES = """\
 Examples:
@@ -69,7 +69,9 @@ def slurm(
     nodes mount or a bucket. A second job after the array logs all runs to MLflow and writes the
     report.
     """
-    config = load(file, overrides, storage, name, seeds)
+    from music_rllib.sweep import driver
+
+    config = driver.load(file, overrides, storage=storage, name=name, seeds=seeds)
     if not _TIME.fullmatch(time):
         raise BadInputError(f"--time must be a time of Slurm such as 12:00:00 or 1-00, got {time}")
     options = {"job-name": config.name, "time": time, "cpus-per-task": cpus, "partition": partition}
