@@ -118,7 +118,6 @@ class Hypothesis(NamedTuple):
 
     @property
     def sides(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
-        """Both conditions."""
         return self.first, self.second
 
     @classmethod

@@ -119,16 +119,13 @@ class Choice(_Dimension):
     """The values."""
 
     def ends(self) -> tuple[Any, ...]:
-        """All values; each must be a valid setting."""
         return tuple(self.choice)
 
     @property
     def size(self) -> int:
-        """Number of values."""
         return len(self.choice)
 
     def values(self) -> tuple[Any, ...]:
-        """All values, for a grid."""
         return tuple(self.choice)
 
     def contains(self, value: Any) -> bool:
@@ -137,7 +134,6 @@ class Choice(_Dimension):
 
     @property
     def rule(self) -> str:
-        """The rule of its values."""
         return f"one of {shown(self.choice)}"
 
 

@@ -72,7 +72,6 @@ class MatchedAlpha(StrictModel):
     `alpha dS_q / d ln sigma` of q = 1 (docs/comparing_q.md)."""
 
     def scaled(self, alpha: float, q: float, actions: int, form: str) -> float:
-        """Alpha at q for a number of action dimensions."""
         return matched_alpha(alpha, q, self.matched_width, actions, form)
 
 
@@ -86,7 +85,6 @@ class NormalisedAlpha(StrictModel):
     so that the pressures on narrow policies differ more than with one alpha."""
 
     def scaled(self, alpha: float, q: float, actions: int, form: str) -> float:
-        """Alpha at q for a number of action dimensions."""
         return normalised_alpha(alpha, q, actions, form)
 
 
@@ -268,7 +266,6 @@ class TACSettings(StrictModel):
 
     @property
     def critic_count(self) -> int:
-        """Number of critics."""
         return self.critics or (1 if self.policy == "deterministic" else 2)
 
     @property

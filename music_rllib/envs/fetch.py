@@ -117,7 +117,6 @@ class _FastFetch:
         return (same and env.has_object == self._has_object) or self.bind()
 
     def _remove(self) -> None:
-        """Restore the environment's own step."""
         for name, method in (("step", self.step), ("_get_obs", self.first_observation)):
             if vars(self._env).get(name) == method:
                 delattr(self._env, name)

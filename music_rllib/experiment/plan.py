@@ -113,7 +113,6 @@ class Plan:
 
     @property
     def searched(self) -> tuple[Stage, ...]:
-        """Stages with a search."""
         return tuple(stage for stage in self._stages.values() if stage.search is not None)
 
     @property
@@ -138,7 +137,6 @@ class Plan:
         ]
 
     def node(self, key: str) -> Node:
-        """The node with this key."""
         return self._nodes[key]
 
     def add_stage(self, stage: Stage, *, with_runs: bool) -> None:

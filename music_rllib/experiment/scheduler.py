@@ -60,7 +60,6 @@ class Scheduler:
         return self._status[key]
 
     def knows(self, key: str) -> bool:
-        """Whether the node is in the scheduler."""
         return key in self._nodes
 
     def is_planned(self, key: str) -> bool:
@@ -68,7 +67,6 @@ class Scheduler:
         return key in self._turns
 
     def node(self, key: str) -> Node:
-        """The node with this key."""
         return self._nodes[key]
 
     def having(self, *statuses: Status) -> list[Node]:
@@ -171,7 +169,6 @@ class Scheduler:
         return True
 
     def start(self, key: str) -> None:
-        """Record that the node is being computed."""
         self._move(key, Status.WAITING, Status.STARTED)
 
     @property

@@ -78,7 +78,6 @@ class SweepLocation:
         return read_json(self._files, file)
 
     def write(self, file: str, text: str) -> None:
-        """Write a file atomically into the storage."""
         self._files.write(file, text.encode())
 
     def keep(self, file: str, text: str) -> None:

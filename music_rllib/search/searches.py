@@ -83,7 +83,6 @@ class Search:
 
     @property
     def over(self) -> bool:
-        """Whether its ranking is complete, or can't be."""
         return self.finalists is not None and all(one.over for one in self.finalists)
 
     def label(self, study: OptunaStudy) -> str:

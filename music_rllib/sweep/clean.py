@@ -38,12 +38,10 @@ class Cleaning:
     """Those of them that have a lease."""
 
     def add(self, folder: StorageFolder, what: str) -> None:
-        """Mark a folder to be deleted."""
         self.folders.append(folder)
         self.items.append({"path": folder.path, "what": what})
 
     def keep(self, path: str, what: str) -> None:
-        """Note a folder that is kept, and why."""
         self.kept.append({"path": path, "what": what})
 
     def delete(self) -> None:

@@ -243,7 +243,7 @@ def _record_analysis_plan(console: Console, opened: OpenSweep) -> list[dict[str,
 
 def _measure(console: Console, opened: OpenSweep) -> dict[str, Any]:
     """Measure and show the cost of the runs that are left; the cost as plain data."""
-    from music_rllib.sweep import cost
+    from music_rllib.sweep.views import cost
 
     left = cost.run_groups(opened.config, opened.plan, opened.finished)
     costs, slots = cost.measure(opened.config, left, console.print)

@@ -29,7 +29,7 @@ from music_rllib.store.history import Report, RunResult, last_values
 from music_rllib.store.lease import process_start, this_machine
 from music_rllib.store.storage import StorageError, is_remote
 from music_rllib.store.work_folder import steps_of
-from music_rllib.sweep.cost import searched_runs
+from music_rllib.sweep.views.cost import searched_runs
 from music_rllib.sweep.views.results import shown_metric
 
 LOCAL_SECONDS, REMOTE_SECONDS = 2.0, 15.0

@@ -23,7 +23,7 @@ from music_rllib.redaction import redact
 
 if TYPE_CHECKING:
     from music_rllib.runtime.ray_cluster import Capacity
-    from music_rllib.sweep.cost import RunGroup
+    from music_rllib.sweep.views.cost import RunGroup
 
 SAMPLED = 50
 """Largest number of finished runs whose speed is averaged."""
@@ -52,7 +52,7 @@ def _searched_runs(config: SweepConfig) -> dict[str, list[RunGroup]]:
     searched = [stage for stage in config.stages if stage.search is not None]
     if not searched:
         return {}
-    from music_rllib.sweep.cost import searched_runs
+    from music_rllib.sweep.views.cost import searched_runs
 
     return {
         stage.name: [one for one in searched_runs(config, stage) if one.stage == stage.name]

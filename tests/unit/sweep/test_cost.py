@@ -9,8 +9,8 @@ import yaml
 from music_rllib.config.load import load_config
 from music_rllib.experiment.plan import make_plan
 from music_rllib.runtime import machine
-from music_rllib.sweep import cost
-from music_rllib.sweep.cost import RunGroup, run_groups
+from music_rllib.sweep.views import cost
+from music_rllib.sweep.views.cost import RunGroup, run_groups
 from music_rllib.training.sample_run import RunSample
 
 

@@ -49,7 +49,6 @@ class RunGroup:
 
     @property
     def label(self) -> str:
-        """`stage/task`."""
         return f"{self.stage}/{self.settings.task.name}"
 
     @property
@@ -59,7 +58,6 @@ class RunGroup:
 
     @property
     def grad_updates(self) -> int:
-        """Gradient updates of one run."""
         learning = self.env_steps - self.settings.tac.steps_before_updates
         return round(learning * self.settings.tac.replay_ratio)
 
