@@ -423,11 +423,11 @@ CORPUS: dict[str, Hostile] = {
     "yaml: python": Hostile(_plan("a: !!python/object/apply:os.system [id]\n"), "must be valid"),
     "indices": Hostile(
         _plan_of(environments=_environment(agent_indices="0:99999999999")),
-        "must have at most 10000 entries",
+        "must be a list of indices or a range such as 0:3",
     ),
     "indices of 4,301 digits": Hostile(
         _plan_of(environments=_environment(agent_indices=f"0:{'9' * 4301}")),
-        "must have at most 10000 entries",
+        "must be a list of indices or a range such as 0:3",
     ),
     "grid points": Hostile(_plan_of(stages=_grid(10, 10, 10, 10, 10, 10, 10)), "got 10,000,000"),
     "runs": Hostile(
@@ -492,7 +492,7 @@ CORPUS: dict[str, Hostile] = {
     ),
     "handoff: indices": Hostile(
         _handoff(lambda m: m["info"]["task"].update(agent_indices="0:99999999999")),
-        "must have at most 10000 entries",
+        "must be a list of indices or a range such as 0:3",
     ),
     "handoff: beyond its observation": Hostile(
         _handoff(lambda m: m["info"]["task"].update(agent_indices=[0], surrounding_indices=[9999])),
