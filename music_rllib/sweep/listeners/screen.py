@@ -9,7 +9,7 @@ from typing import Self
 
 from rich.console import Console, Group
 from rich.live import Live
-from rich.progress import Progress, Task, TaskID
+from rich.progress import Progress, Task
 from rich.text import Text
 
 from music_rllib import names
@@ -58,7 +58,7 @@ class Display(Listener):
         """Env steps of runs that were interrupted, stopped early or failed."""
         self._progress = Progress(get_time=now, speed_estimate_period=PACE_SECONDS)
         """Env steps, speed and remaining time of the running runs."""
-        self._running: dict[str, TaskID] = {}
+        self._running: dict[str, Task] = {}
         self._printed: dict[str, float] = {}
         """Node key to the time of its last line."""
         self._print_all = os.environ.get(names.VARIABLE_PROGRESS) == "all"
@@ -89,20 +89,18 @@ class Display(Listener):
         self._printed[node.key] = self._now()
         self._say_of(node, "started")
 
-    def _task(self, node: Node) -> TaskID:
+    def _task(self, node: Node) -> Task:
         if node.key not in self._running:
-            self._running[node.key] = self._progress.add_task(
-                node.label, total=node.run.env_steps, node=node, metrics={}
-            )
+            self._progress.add_task("", total=node.run.env_steps, node=node, metrics={})
+            self._running[node.key] = self._progress.tasks[-1]
         return self._running[node.key]
 
     def reported(self, node: Node, reports: list[Report]) -> None:
-        number, steps = self._task(node), reports[-1].env_steps
+        task, steps = self._task(node), reports[-1].env_steps
         # Steps without learning are many times faster than the others.
         learns = steps > node.run.tac.steps_before_updates
         change = self._progress.update if learns else self._progress.reset
-        change(number, completed=steps)
-        task = next(one for one in self._progress.tasks if one.id == number)
+        change(task.id, completed=steps)
         task.fields["metrics"] |= last_values(reports)
         if self._console.is_terminal or steps >= node.run.env_steps:
             return  # the table shows it, or the line of `finished` will
@@ -119,7 +117,8 @@ class Display(Listener):
         self.say(text, "yellow")
 
     def finished(self, node: Node, result: RunResult) -> None:
-        self._remove(node)
+        self._leave(node)
+        self._spent.pop(node.key, None)
         evaluated = evaluation_text(node.run, result.metrics, any_step=True)
         cost = f"{result.env_steps:,} env steps in {clock(result.seconds)}"
         self._say_of(node, f"finished, {evaluated}, {cost}", "green")
@@ -146,17 +145,10 @@ class Display(Listener):
         self._leave(node)
 
     def _leave(self, node: Node) -> None:
-        """Keep the env steps that an unfinished run has spent."""
-        if node.key in self._running:
-            self._spent[node.key] = self._remove(node)
-
-    def _remove(self, node: Node) -> int:
-        """Show the run no longer; its env steps."""
-        number = self._running.pop(node.key, None)
-        done = sum(int(task.completed) for task in self._progress.tasks if task.id == number)
-        if number is not None:
-            self._progress.remove_task(number)
-        return done
+        """Show a run no longer, and keep the env steps that it has spent if it is unfinished."""
+        if (task := self._running.pop(node.key, None)) is not None:
+            self._progress.remove_task(task.id)
+            self._spent[node.key] = int(task.completed)
 
     def tick(self) -> None:
         now = self._now()
@@ -175,7 +167,7 @@ class Display(Listener):
         wide = self._console.width >= WIDE
         heads = ("running", "env steps", *["steps/s"] * wide, "left", "evaluated")
         table = new_table("", heads, left=["running"])
-        for task in self._progress.tasks:
+        for task in self._running.values():
             node, found = task.fields["node"], task.fields["metrics"]
             done = f"{task.completed:,} / {task.total:,}" if wide else f"{task.percentage:.0f} %"
             table.add_row(
@@ -193,7 +185,7 @@ class Display(Listener):
 
     def _summary(self) -> str:
         """`1 of 4 runs finished, 8,000 of 24,000 env steps, 1:02 passed, about 2:10 left`."""
-        done, running = self._scheduler.having(*DONE), self._progress.tasks
+        done, running = self._scheduler.having(*DONE), self._running.values()
         reached = sum(task.completed for task in running)
         steps = sum(node.run.env_steps for node in done) + sum(self._spent.values()) + reached
         text = (
