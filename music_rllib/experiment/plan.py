@@ -1,8 +1,7 @@
-"""The plan of a sweep: its runs, and the nodes that compute them, in order.
+"""The plan of a sweep: its runs, in order.
 
-A *run* is a trial of a stage on one task with one seed. A *node* is the computation of a run: its
-key is the hash of everything that determines the result, so equal computations share a node, within
-a sweep and between sweeps.
+Runs with the same key have the same result, within a sweep and between sweeps: the nodes of a plan
+are its runs of different keys, and each is computed once.
 """
 
 from __future__ import annotations
@@ -41,8 +40,8 @@ class Input:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Run:
-    """One trial of a stage on one task with one seed."""
+class Node:
+    """One run: a trial of a stage on one task with one seed."""
 
     stage: str
     trial: int
@@ -50,12 +49,20 @@ class Run:
     values: Mapping[str, Any] = field(compare=False)
     """The settings that differ between the stage's trials: dotted setting to value;
     `pretrain:tac.alpha` is a value of its source."""
-    task: str
-    seed: int
+    run: RunSettings
+    input: Input | None
     key: str
-    """Key of the node that computes it."""
+    """Hash of everything that determines the result."""
     part: str = ""
     """In a searched stage `trial7`, or `final7` on fresh seeds."""
+
+    @property
+    def task(self) -> str:
+        return self.run.task.name
+
+    @property
+    def seed(self) -> int:
+        return self.run.seed
 
     @property
     def label(self) -> str:
@@ -63,14 +70,6 @@ class Run:
         values = ",".join(f"{name}={short(value, name)}" for name, value in self.values.items())
         parts = (self.stage, self.task, self.part, values, f"seed{self.seed}")
         return "/".join(filter(None, parts))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Node(Run):
-    """The computation of one run, and of all others with the same key."""
-
-    run: RunSettings
-    input: Input | None
 
     @property
     def source_key(self) -> str | None:
@@ -88,16 +87,16 @@ class Plan:
         self.name = name
         self.seeds = tuple(seeds)
         self.algorithm = algorithm or ALGORITHM_VERSION
-        self._runs: dict[tuple[str, str], Run] = {}
+        self._runs: dict[tuple[str, str], Node] = {}
         """By label and key."""
         self._trials: dict[str, dict[str, Any]] = {}
         self._nodes: dict[str, Node] = {}
-        self._by_cell: dict[tuple[str, int, str, int], Run] = {}
+        self._by_cell: dict[tuple[str, int, str, int], Node] = {}
         """Runs of stages without a search, by stage, trial, task and seed."""
         self._stages: dict[str, Stage] = {}
 
     @property
-    def runs(self) -> list[Run]:
+    def runs(self) -> list[Node]:
         """All runs, in the order of planning."""
         return list(self._runs.values())
 
@@ -158,7 +157,7 @@ class Plan:
 
     def add_trial(
         self, stage: str, trial: int, values: Mapping[str, Any], seeds: Sequence[int], part: str
-    ) -> list[Run]:
+    ) -> list[Node]:
         """Add the runs of a searched stage's trial and the runs that it starts from.
 
         The `values` are dotted settings, `STAGE:setting` for a source stage; `part` is the name of
@@ -213,20 +212,19 @@ class Plan:
         settings: RunSettings,
         node_input: Input | None,
         part: str = "",
-    ) -> Run:
-        run = Run(
+    ) -> Node:
+        node = Node(
             stage=stage.name,
             trial=trial,
             values=dict(values),
-            task=settings.task.name,
-            seed=settings.seed,
+            run=settings,
+            input=node_input,
             key=node_key(settings, node_input.key if node_input else None, self.algorithm),
             part=part,
         )
-        node = Node(**vars(run), run=settings, input=node_input)
-        self._runs.setdefault((run.label, run.key), run)
-        self._nodes.setdefault(run.key, node)
-        return run
+        self._runs.setdefault((node.label, node.key), node)
+        self._nodes.setdefault(node.key, node)
+        return node
 
     def _source_trials(self, source: Source | None) -> list[int]:
         """Trials of a source stage, each of which is combined with every point of the grid."""

@@ -13,7 +13,7 @@ from music_rllib.config.problems import ConfigError
 from music_rllib.config.search import FINAL_SEED, SearchSettings
 from music_rllib.errors import first_line
 from music_rllib.experiment.open_sweep import OpenSweep
-from music_rllib.experiment.plan import Node, Run
+from music_rllib.experiment.plan import Node
 from music_rllib.experiment.scheduler import DONE, LOST, Failure, Listener, Status
 from music_rllib.redaction import redact
 from music_rllib.results.statistics import Array
@@ -171,7 +171,7 @@ class SearchController(Listener):
         trial: FrozenTrial,
         seeds: Sequence[int],
         phase: str = "trial",
-    ) -> list[Run]:
+    ) -> list[Node]:
         """The runs of a trial, which are added to the plan; the studies' trials alternate there.
 
         Raises:
@@ -181,14 +181,14 @@ class SearchController(Listener):
         part = f"{phase}{trial.number}"
         return self._plan.add_trial(search.stage.name, number, study.point(trial), seeds, part)
 
-    def _nodes_of(self, run: Run) -> list[Node]:
+    def _nodes_of(self, run: Node) -> list[Node]:
         """The node of a run, after the planned node that it starts from, if there is one."""
         node = self._plan.node(run.key)
         if node.input is None or node.input.checkpoint is not None:
             return [node]
         return [self._plan.node(node.input.key), node]
 
-    def _request(self, run: Run, until: int | None) -> None:
+    def _request(self, run: Node, until: int | None) -> None:
         """Ask for a run up to an environment step; None: to its end."""
         for node in self._nodes_of(run):
             new = not self._scheduler.knows(node.key)
@@ -282,7 +282,7 @@ class SearchController(Listener):
         return True
 
     def _scores(
-        self, settings: SearchSettings, runs: Sequence[Run], until: int | None
+        self, settings: SearchSettings, runs: Sequence[Node], until: int | None
     ) -> list[Array]:
         """Scores `[seeds, tasks]` for each objective; `runs` has those of a seed together.
 

@@ -23,7 +23,7 @@ from music_rllib.config.schema import Stage
 from music_rllib.config.search import Rung, SearchSettings
 from music_rllib.errors import first_line
 from music_rllib.experiment.open_sweep import OpenSweep
-from music_rllib.experiment.plan import Run, node_key
+from music_rllib.experiment.plan import Node, node_key
 from music_rllib.redaction import redact
 from music_rllib.results.statistics import Array
 from music_rllib.search.study import OptunaStudy
@@ -42,7 +42,7 @@ class RunningTrial:
 
     study: OptunaStudy
     trial: FrozenTrial
-    runs: list[Run] = field(default_factory=list)
+    runs: list[Node] = field(default_factory=list)
     """Its runs at the rung."""
     rung: int = 0
 
@@ -56,7 +56,7 @@ class Finalist:
     """Its point, with the compared values."""
     searched: tuple[float, ...]
     """Its objective values in the search."""
-    runs: list[Run]
+    runs: list[Node]
     scores: list[Array] | None = None
     """For each objective `[seeds, tasks]` on fresh seeds; None until all runs have ended."""
     failure: str = ""
