@@ -7,7 +7,7 @@ from typing import Any
 
 from music_rllib import names
 from music_rllib.config.layers import PlacedPoint, is_in
-from music_rllib.config.problems import ConfigError, Findings, KeyPath, shown
+from music_rllib.config.problems import ConfigError, Findings, KeyPath, shown, unknown
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.schema import Analysis, Hypothesis, Point, Stage, same_value
 from music_rllib.config.search import SearchSettings, of_stage
@@ -156,8 +156,10 @@ def _check_points_to_evaluate(search: SearchSettings, findings: Findings) -> Non
     """
     for position, point in enumerate(search.points_to_evaluate):
         for name, value in point.items():
-            dimension, path = search.space[name], ("points_to_evaluate", position, name)
-            if not dimension.contains(value):
+            dimension, path = search.space.get(name), ("points_to_evaluate", position, name)
+            if dimension is None:
+                findings.add(path, unknown(name, search.space))
+            elif not dimension.contains(value):
                 findings.add(path, f"must be {dimension.rule}, got {shown(value)}")
             elif not dimension.applies(point):
                 wanted = " and ".join(f"{key}: {shown(one)}" for key, one in dimension.when.items())

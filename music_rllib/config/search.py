@@ -263,12 +263,8 @@ class SearchSettings(StrictModel):
                 f"points_to_evaluate must not be more than the trials ({self.trials}), "
                 f"got {len(self.points_to_evaluate)}"
             )
-        for point in self.points_to_evaluate:
-            for name in point:
-                if name not in self.space:
-                    yield f"points_to_evaluate must hold settings of the space, got {name!r}"
-            if self.sampler == "grid":
-                yield f"points_to_evaluate must be empty with sampler: grid, got {len(point)}"
+        if self.points_to_evaluate and self.sampler == "grid":
+            yield "points_to_evaluate must be empty with sampler: grid, got points"
 
     def _settings_varied_twice(self) -> Iterator[str]:
         varied = {
@@ -294,15 +290,11 @@ class SearchSettings(StrictModel):
                 yield f"space must have at most {most} points with sampler: grid, got more"
         elif self.trials is None:
             yield f"trials must be given with sampler: {self.sampler}, got null"
-        if self.sampler == "cmaes":
-            for name, dimension in self.space.items():
-                if isinstance(dimension, Choice) or dimension.when:
-                    yield (
-                        f"space.{name} must be a number without 'when' for sampler: cmaes, "
-                        "got another"
-                    )
-        if self.sampler == "cmaes" and len(self.objectives) > 1:
-            yield "sampler must be tpe, nsga2, random or grid for several objectives, got cmaes"
+        if self.sampler == "cmaes" and (
+            len(self.objectives) > 1
+            or any(isinstance(one, Choice) or one.when for one in self.space.values())
+        ):
+            yield "sampler must not be cmaes for several objectives, choices and 'when', got cmaes"
 
     def _broken_pruning(self) -> Iterator[str]:
         if self.pruning is None:

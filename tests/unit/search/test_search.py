@@ -204,7 +204,7 @@ MISTAKES: list[tuple[Document, str]] = [
     ({"sampler": "grid"}, "space.tac.alpha must have a step to be part of a grid"),
     (
         {"sampler": "cmaes", "space": {"tac.policy_critic": {"choice": ["min", "first"]}}},
-        "space.tac.policy_critic must be a number without 'when' for sampler: cmaes",
+        "sampler must not be cmaes for several objectives, choices and 'when', got cmaes",
     ),
     ({"mode": "compare"}, "compare must be given with mode: compare, and only there"),
     (
