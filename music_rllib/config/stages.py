@@ -63,6 +63,7 @@ def resolve_stage(
     problems_before = len(findings.problems)
     header = _header(raw, findings)
     if header is None:
+        _check_defaults(defaults, findings)
         return None
     if header.name in earlier:
         findings.add(("name",), f"must not repeat, got {header.name!r} again")
@@ -147,6 +148,16 @@ class _StageSettings:
             lines = [f"{problem.path[-1]} {problem.rule}" for problem in findings.problems]
             raise ConfigError(list(dict.fromkeys(lines)))
         return point
+
+
+def _check_defaults(defaults: Mapping[str, Any], findings: Findings) -> None:
+    """Report the mistakes in `defaults` beside an invalid stage, whose settings are not checked."""
+    found = Findings()
+    settings = _StageSettings(
+        variant="tac", tasks=(), defaults=defaults, own={"per_task": {}}, seed=0, path=()
+    )
+    settings.at({}, found)
+    findings.problems += [one for one in found.problems if one.path[:1] == ("defaults",)]
 
 
 def _header(raw: dict[str, Any], findings: Findings) -> StageHeader | None:
