@@ -56,6 +56,7 @@ from music_rllib.config.tac_settings import (
     NormalisedAlpha,
     TACSettings,
 )
+from music_rllib.envs.features import Mirror, Translation
 from music_rllib.envs.tasks import BUILT_IN_TASKS, Task
 from music_rllib.intrinsic.settings import IntrinsicSettings, MusicSettings
 from music_rllib.schedules import Linear, Measured, Piecewise
@@ -219,6 +220,8 @@ def document() -> str:
         "## Environments",
         "`environments` maps a task's name to its definition:",
         table(rows(Task, "", skip=("name",))),
+        "`symmetries` of an environment ([example](add_an_environment.md#symmetries)):",
+        table([*rows(Mirror, "mirror."), *rows(Translation, "translate[].")]),
     ]
     return "\n\n".join(part.strip() for part in parts) + "\n"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import mmap
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,6 +14,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from music_rllib.envs.episodes import Recording, lost_by_rounding, random_offsets
+from music_rllib.envs.features import Augmentation, Symmetries, Symmetry
 from music_rllib.envs.tasks import (
     BUILT_IN_TASKS,
     LAST_SEED,
@@ -31,7 +32,7 @@ from music_rllib.envs.values import (
 )
 from music_rllib.errors import first_line, one_line
 from music_rllib.replay.buffer import GoalReward
-from music_rllib.replay.trajectories import ReplayLayout
+from music_rllib.replay.trajectories import ReplayLayout, Transitions
 
 Env = gym.Env[Any, Any]
 
@@ -250,6 +251,40 @@ def _play_some(reward: GoalReward, env: Env, first: Any) -> Recording:
         recording.step(action[0], given, info, after)
         ended = terminated or truncated
     return recording
+
+
+def augmentation_of(
+    symmetries: Symmetries, used: Collection[Symmetry], layout: ReplayLayout, env: Env,
+    *, reward: GoalReward | None = None, seed: int = 0,
+) -> Augmentation:  # fmt: skip
+    """The task's symmetries for a replay; with `reward`, goals have a place and change, too.
+
+    Resets `env` if there is a `reward`.
+
+    Raises:
+        ValueError: They do not fit the environment, or change rewards.
+    """
+    augmentation = Augmentation(symmetries, used, layout, goals=reward is not None)
+    if reward is None:
+        return augmentation
+    start = np.asarray(env.reset(seed=seed)[0]["achieved_goal"], np.float32)
+    rows = 256
+    inputs = np.zeros((2, rows, layout.network_input), np.float32)
+    inputs[:, :, layout.observation :] = start
+    inputs[1, :, layout.observation :] += random_offsets(rows, layout.goal, 1e-3, 1.0)
+    achieved, desired = inputs[:, :, layout.observation :]
+    rewards = reward(achieved, desired)
+    none = np.zeros(rows, np.float32)
+    actions = np.zeros((rows, layout.action), np.float32)
+    changed = Transitions(inputs[0], actions, none, none, inputs[1], None, np.arange(rows))
+    augmentation(np.random.default_rng(0), changed)
+    # A few goals may lie so near a threshold that rounding decides.
+    if np.mean(~np.isclose(reward(achieved, desired), rewards, rtol=1e-3, atol=1e-4)) > 0.02:
+        raise ValueError(
+            f"replay.symmetries must keep rewards: with {name_of(env)}, compute_reward differs if "
+            "both goals change; see `goal` of the task's symmetries"
+        )
+    return augmentation
 
 
 MOVED_SHARE = 0.2

@@ -25,8 +25,17 @@ from gymnasium import spaces
 from pydantic import BaseModel
 
 from music_rllib.envs.episodes import Episode, Recording
-from music_rllib.envs.make import Env, goal_reward_of, make_env, moved_distance_of, reset_seed
-from music_rllib.envs.tasks import Task, beyond_observation, closest
+from music_rllib.envs.features import beyond_observation
+from music_rllib.envs.make import (
+    Env,
+    augmentation_of,
+    compute_reward_of,
+    goal_reward_of,
+    make_env,
+    moved_distance_of,
+    reset_seed,
+)
+from music_rllib.envs.tasks import Task, closest
 from music_rllib.envs.values import (
     GOAL_KEYS,
     BadNumberError,
@@ -144,6 +153,7 @@ class Probe:
         first = self._play(env, largest, actions=0)
         if self._hindsight and goal:
             self._reward = self._goal_reward(env, smallest)
+        self._check_symmetries(env, smallest)
         self._play(env, smallest, actions=1, steps=REPEATED_STEPS)
         self._repeat(env, first, largest)
         self._play_more(env)
@@ -216,6 +226,16 @@ class Probe:
         except BaseException as error:
             raise RefusedError(f"compute_reward() raised {one_line(error)}") from error
         return reward
+
+    def _check_symmetries(self, env: Env, seed: int) -> None:
+        symmetries = self._task.symmetries
+        reward = compute_reward_of(env) if symmetries.kinds else None
+        try:
+            augmentation_of(
+                symmetries, symmetries.kinds, self._layout, env, reward=reward, seed=seed
+            )
+        except ValueError as error:
+            self.problems.append(first_line(error))
 
     # -- episodes -------------------------------------------------------------------------
 

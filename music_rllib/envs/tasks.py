@@ -20,11 +20,10 @@ import contextlib
 import difflib
 import importlib.util
 import os
-import re
 import site
 import sys
 import sysconfig
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
@@ -32,7 +31,6 @@ from typing import Annotated, Any, Self
 
 from pydantic import (
     BaseModel,
-    BeforeValidator,
     ConfigDict,
     Field,
     JsonValue,
@@ -41,58 +39,11 @@ from pydantic import (
 )
 
 from music_rllib import names
-from music_rllib.limits import MOST_INDICES
-
-_RANGE = re.compile(r"(\d{1,5}):(\d{1,5})")
-
-
-def _expand_range(value: Any) -> Any:
-    """Turn `"3:6"` into (3, 4, 5) and a list into a tuple; return other values unchanged."""
-    if not isinstance(value, str):
-        return tuple(value) if isinstance(value, list) else value
-    bounds = _RANGE.fullmatch(value.strip())
-    if bounds is None or int(bounds[1]) > int(bounds[2]):
-        raise ValueError(f"must be a list of indices or a range such as 0:3, got {value[:40]!r}")
-    return tuple(range(int(bounds[1]), int(bounds[2])))
-
-
-Indices = Annotated[
-    tuple[Annotated[int, Field(ge=0)], ...],
-    Field(max_length=MOST_INDICES),
-    BeforeValidator(_expand_range, json_schema_input_type=tuple[int, ...] | str),
-]
-"""Positions in the observation vector: a list, or a half-open range `a:b` as in Python."""
-
+from music_rllib.envs.features import Indices, Mirror, Symmetries, Translation, check_split
 
 LAST_SEED = 2**31 - 1
 """Largest seed of a reset: environments often keep it in a signed 32-bit integer."""
 Seed = Annotated[int, Field(ge=0, le=LAST_SEED)]
-
-
-def beyond_observation(
-    agent_indices: Sequence[int], surrounding_indices: Sequence[int], size: int
-) -> list[str]:
-    """Explain why a split does not fit an observation of this size; empty if it does."""
-    parts = (("agent_indices", agent_indices), ("surrounding_indices", surrounding_indices))
-    return [
-        f"{name} must be < {size}, the size of the observation, got {max(indices)}"
-        for name, indices in parts
-        if indices and max(indices) >= size
-    ]
-
-
-def check_split(agent_indices: Sequence[int], surrounding_indices: Sequence[int]) -> None:
-    """Raise ValueError unless a split has both parts or neither, and repeats no index."""
-    if bool(agent_indices) != bool(surrounding_indices):
-        missing = "surrounding_indices" if agent_indices else "agent_indices"
-        raise ValueError(f"{missing} must be given too: a split needs both parts")
-    parts = (("agent_indices", agent_indices), ("surrounding_indices", surrounding_indices))
-    for name, indices in parts:
-        if len(set(indices)) < len(indices):
-            raise ValueError(f"{name} must not repeat an index, got {list(indices)}")
-    shared = sorted(set(agent_indices) & set(surrounding_indices))
-    if shared:
-        raise ValueError(f"agent and surrounding indices must not overlap, both have {shared}")
 
 
 class Task(BaseModel):
@@ -129,6 +80,8 @@ class Task(BaseModel):
     """Distance in the goal's units from which the achieved goal has moved, for
     `replay.hindsight_episodes: moved`. null: it has moved if a sparse reward changes; with dense
     rewards a fifth of the environment's `distance_threshold`."""
+    symmetries: Symmetries = Symmetries()
+    """Symmetries of the environment, for `replay.symmetries`."""
 
     @field_validator("env_kwargs")
     @classmethod
@@ -165,7 +118,7 @@ class Task(BaseModel):
 
         The default `seed_range` is omitted: run keys are older than this setting.
         """
-        excluded = {"name", "reward_range", "mi_reward_weight", "moved_distance"}
+        excluded = {"name", "reward_range", "mi_reward_weight", "moved_distance", "symmetries"}
         if self.seed_range == (0, LAST_SEED):
             excluded.add("seed_range")
         return self.model_dump(mode="json", exclude=excluded)
@@ -176,6 +129,23 @@ _SPARSE = (-1.0, 0.0)
 
 
 def _fetch(name: str, *, split: bool = True, mi_reward_weight: float = 1.0) -> Task:
+    # Observation: positions of gripper, object, and object relative to gripper; fingers; angles,
+    # velocities, and angular velocities of the object; velocities of gripper and fingers. Reach has
+    # no object. The table is symmetric about y = 0.75, in front of the robot.
+    mirror = (
+        Mirror(
+            positions=(1, 4), goal=(1,), plane=0.75, signs=(7, 11, 13, 15, 17, 19, 21), action=(1,),
+            swap=((9, 10), (23, 24)),
+        )
+        if split
+        else Mirror(
+            positions=(1,), goal=(1,), plane=0.75, signs=(6,), action=(1,), swap=((3, 4), (8, 9))
+        )
+    )  # fmt: skip
+    moves = [
+        Translation(positions=(axis, axis + 3) if split else (axis,), goal=(axis,), distance=0.1)
+        for axis in (0, 1)
+    ]
     return Task(
         name=name,
         env_id=f"{name}-v4",
@@ -184,6 +154,7 @@ def _fetch(name: str, *, split: bool = True, mi_reward_weight: float = 1.0) -> T
         surrounding_indices=(3, 4, 5) if split else (),
         reward_range=_SPARSE,
         mi_reward_weight=mi_reward_weight,
+        symmetries=Symmetries(mirror=mirror, translate=tuple(moves)),
     )
 
 

@@ -10,8 +10,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from music_rllib.envs.features import beyond_observation
 from music_rllib.envs.make import Env, make_env, name_of, reset_seed
-from music_rllib.envs.tasks import beyond_observation
 from music_rllib.envs.values import check_action_space, number_of, observation_sizes, success_of
 from music_rllib.policy.policy import Policy, PolicyError, unknown_environment
 

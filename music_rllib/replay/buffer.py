@@ -59,6 +59,7 @@ class TrajectoryReplay(TrajectoryRing):
             `goal_reward`, which must be sparse.
         td_exponent: PER (Schaul et al. 2016): draw transitions with probability proportional to
             their absolute TD error to this power. None: uniformly.
+        augment: changes drawn transitions in place by symmetries of the task.
 
     Raises:
         ValueError: one episode does not fit, or hindsight is on without goals.
@@ -78,6 +79,7 @@ class TrajectoryReplay(TrajectoryRing):
         hindsight_episodes: Literal["all", "moved"] = "all",
         moved_distance: float | None = None,
         td_exponent: float | None = None,
+        augment: Callable[[np.random.Generator, Transitions], None] | None = None,
     ) -> None:
         super().__init__(layout, capacity)
         if hindsight_k > 0 and (goal_reward is None or layout.goal == 0):
@@ -88,6 +90,7 @@ class TrajectoryReplay(TrajectoryRing):
         self._goal_reward = goal_reward
         self._hindsight_share = hindsight_k / (1.0 + hindsight_k)
         self._goals, self._n_steps, self._gamma = hindsight_goals, n_steps, gamma
+        self._augment = augment
         self._only_moved = hindsight_episodes == "moved" and hindsight_k > 0
         self._moved_distance = moved_distance
         self._moved = np.zeros(0, np.bool_)
@@ -196,6 +199,8 @@ class TrajectoryReplay(TrajectoryRing):
         drawn = Transitions(inputs, actions, rewards, discounts, next_inputs, weights, row)
         for i in range(1, self._n_steps):
             self._add_step(drawn, i, np.flatnonzero(step + i < length), chosen)
+        if self._augment is not None:
+            self._augment(self.rng, drawn)
         return drawn
 
     def _achieved(self, start: Rows, step: Rows, length: Rows) -> Floats:

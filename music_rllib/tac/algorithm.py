@@ -30,7 +30,12 @@ from ray.rllib.utils.metrics import (
 from ray.rllib.utils.typing import StateDict
 
 from music_rllib.envs.episodes import Episode
-from music_rllib.envs.make import goal_reward_of, moved_distance_of
+from music_rllib.envs.make import (
+    augmentation_of,
+    compute_reward_of,
+    goal_reward_of,
+    moved_distance_of,
+)
 from music_rllib.envs.values import BadNumberError
 from music_rllib.intrinsic.relabeling import reward_class
 from music_rllib.replay.buffer import TrajectoryReplay
@@ -83,6 +88,13 @@ class TAC(Algorithm):
         moved_distance = self.config.moved_distance
         if goal_reward and settings.hindsight_episodes == "moved" and moved_distance is None:
             moved_distance = moved_distance_of(runner.env, goal_reward, seed)
+        augment = None
+        if settings.symmetries:
+            with_goals = self._settings.music.goals == "environment"
+            augment = augmentation_of(
+                self.config.task_symmetries, settings.symmetries, runner.layout, runner.env,
+                reward=compute_reward_of(runner.env) if with_goals else None, seed=seed,
+            )  # fmt: skip
         return TrajectoryReplay(
             runner.layout,
             settings.capacity,
@@ -95,6 +107,7 @@ class TAC(Algorithm):
             hindsight_episodes=settings.hindsight_episodes,
             moved_distance=moved_distance,
             td_exponent=settings.priority_exponent if settings.priority == "td_error" else None,
+            augment=augment,
         )
 
     def _runner_with_environment(self) -> TrajectoryEnvRunner:

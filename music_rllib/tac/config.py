@@ -14,7 +14,8 @@ from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 from music_rllib.config.problems import problems_of
 from music_rllib.config.run_settings import ReplaySettings
 from music_rllib.config.tac_settings import TACSettings
-from music_rllib.envs.tasks import LAST_SEED, Indices, check_split
+from music_rllib.envs.features import Indices, Symmetries, check_split
+from music_rllib.envs.tasks import LAST_SEED
 from music_rllib.intrinsic.settings import IntrinsicSettings, MusicSettings
 from music_rllib.runtime.quiet import quiet_third_parties
 from music_rllib.schedules import Linear, Measured, StrictModel, check_measurable
@@ -69,6 +70,7 @@ class TACConfigBase(AlgorithmConfig):
         # Success of a step whose info lacks the key; None leaves the step out of success rates.
         self.success_if_missing: bool | None = None
         self.moved_distance: float | None = None
+        self.task_symmetries = Symmetries()
         self.framework_str = "torch"
         self.env_runner_cls = TrajectoryEnvRunner
         # One iteration is one episode per sub-environment and the updates after it.
@@ -151,20 +153,24 @@ class TACConfigBase(AlgorithmConfig):
         """
         return self._set(_prefixed("intrinsic", settings, IntrinsicSettings))
 
-    def replay(self, *, moved_distance: float | None = NotProvided, **settings: Any) -> Self:
+    def replay(
+        self, *, moved_distance: float | None = NotProvided,
+        task_symmetries: Symmetries = NotProvided, **settings: Any,
+    ) -> Self:  # fmt: skip
         """Set the hyperparameters of replay and hindsight.
 
         Args:
             moved_distance: for `hindsight_episodes: moved`, the distance from the first achieved
                 goal that counts as moved. None: the task's reward decides; with dense rewards, a
                 fifth of the environment's `distance_threshold`.
+            task_symmetries: symmetries of the environment, for the setting `symmetries`.
             **settings: fields of `ReplaySettings`.
 
         Raises:
             TypeError: unknown setting.
         """
         fields = _prefixed("replay", settings, ReplaySettings)
-        return self._set(fields, moved_distance=moved_distance)
+        return self._set(fields, moved_distance=moved_distance, task_symmetries=task_symmetries)
 
     def use(self, settings: AlgorithmSettings) -> Self:
         """Take over validated settings, such as those of a sweep's run; nothing is validated."""

@@ -33,6 +33,7 @@ from ray.rllib.utils.typing import StateDict
 
 from music_rllib.config.tac_settings import ColoredNoise, TACSettings
 from music_rllib.envs.episodes import Episode, Recording
+from music_rllib.envs.features import beyond_observation
 from music_rllib.envs.make import (
     Env,
     compute_reward_of,
@@ -43,7 +44,6 @@ from music_rllib.envs.make import (
     name_of,
     reset_seed,
 )
-from music_rllib.envs.tasks import beyond_observation
 from music_rllib.envs.values import BadNumberError, check_action_space, observation_sizes, to_bounds
 from music_rllib.replay.trajectories import ReplayLayout
 from music_rllib.runtime.quiet import quiet_third_parties

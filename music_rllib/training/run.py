@@ -62,7 +62,7 @@ def algorithm_config(run: RunSettings) -> TACConfig:
     tac = run.tac.model_copy(update={"max_episode_steps": steps})
     config.use(AlgorithmSettings(tac, run.music, run.replay, split, run.intrinsic))
     config.training(total_env_steps=run.env_steps)
-    config.replay(moved_distance=run.task.moved_distance)
+    config.replay(moved_distance=run.task.moved_distance, task_symmetries=run.task.symmetries)
     config.success_key, config.success_if_missing = run.task.success_key, False
     config.seed_range = run.task.seed_range
     # `TrainingRun` evaluates at given environment steps.

@@ -164,6 +164,23 @@ def test_moved_distance_is_part_of_the_key_only_if_used() -> None:
     assert node_key(settings(task=task, **moved), None) != node_key(settings(**moved), None)
 
 
+def test_symmetries_are_part_of_the_key_only_if_used() -> None:
+    push = BUILT_IN_TASKS["FetchPush"]
+    mirror = push.symmetries.model_copy(update={"translate": ()})
+    other = push.model_copy(update={"symmetries": mirror})
+    assert node_key(settings(task=other), None) == node_key(settings(), None)
+    used = {"replay": {"symmetries": ["mirror"]}}
+    keys = [node_key(settings(task=task, **used), None) for task in (push, other)]
+    assert keys[0] == keys[1] != node_key(settings(), None)
+    both = {"replay": {"symmetries": ["translate", "mirror"]}}
+    assert node_key(settings(**both), None) == node_key(
+        settings(replay={"symmetries": ["mirror", "translate"]}), None
+    )
+    block = BUILT_IN_TASKS["HandManipulateBlock"]
+    with pytest.raises(ValueError, match="got mirror: HandManipulateBlock has none"):
+        settings(task=block, **used)
+
+
 def test_settings_of_no_intrinsic_reward_are_not_part_of_the_key() -> None:
     assert node_key(settings(intrinsic={"weight": 0.7}), None) == node_key(settings(), None)
     keys = {

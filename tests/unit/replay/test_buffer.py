@@ -12,7 +12,12 @@ from hypothesis import strategies as st
 
 from music_rllib.replay.buffer import TrajectoryReplay
 from music_rllib.replay.sampling import SumTree, draw_weighted, rank_weights
-from music_rllib.replay.trajectories import ReplayLayout, Trajectory, WholeTrajectories
+from music_rllib.replay.trajectories import (
+    ReplayLayout,
+    Trajectory,
+    Transitions,
+    WholeTrajectories,
+)
 
 LAYOUT = ReplayLayout(observation=3, action=2, goal=1, horizon=5)
 
@@ -231,6 +236,24 @@ def test_jitter_within_moved_distance_does_not_count_as_moved(jitter: float) -> 
     )
     batch = buffer.sample_transitions(5_000)
     assert batch.inputs[batch.inputs[:, 3] >= 0, 0].min() == 50
+
+
+def test_drawn_transitions_are_augmented_with_their_final_goals() -> None:
+    def add_one(rng: np.random.Generator, drawn: Transitions) -> None:
+        for inputs in (drawn.inputs, drawn.next_inputs):
+            inputs += 1.0
+
+    options: dict[str, Any] = {"goal_reward": dense, "hindsight_k": 4.0, "n_steps": 3}
+    plain, augmented = (
+        TrajectoryReplay(LAYOUT, 500, np.random.default_rng(0), augment=augment, **options)
+        for augment in (None, add_one)
+    )
+    for buffer in (plain, augmented):
+        buffer.extend([resting(number, 5) for number in range(9)])
+    before, after = plain.sample_transitions(500), augmented.sample_transitions(500)
+    np.testing.assert_array_equal(after.inputs, before.inputs + 1.0)
+    np.testing.assert_array_equal(after.next_inputs, before.next_inputs + 1.0)
+    np.testing.assert_array_equal(after.rewards, before.rewards)
 
 
 def test_trajectories_of_one_length_are_drawn_whole_without_padding() -> None:
