@@ -141,13 +141,15 @@ class Augmentation:
         goals: whether goals have a place; False if they are all 0.
 
     Raises:
-        ValueError: an entry is beyond the observation, the goal or the action.
+        ValueError: the task lacks one, or an entry is beyond the observation, goal or action.
     """
 
     def __init__(
         self, symmetries: Symmetries, used: Collection[Symmetry], layout: ReplayLayout,
         *, goals: bool = True,
     ) -> None:  # fmt: skip
+        if missing := set(used) - set(symmetries.kinds):
+            raise ValueError(f"the task must have the symmetry {missing.pop()} to use it")
         self._layout, self._goals = layout, goals
         self._mirrors, mirror = "mirror" in used, symmetries.mirror or Mirror()
         places = self._places("mirror", mirror)

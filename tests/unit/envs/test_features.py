@@ -8,7 +8,7 @@ import pytest
 from gymnasium_robotics.utils import mujoco_utils
 from pydantic import ValidationError
 
-from music_rllib.envs.features import Augmentation, Mirror, Symmetries, Translation
+from music_rllib.envs.features import Augmentation, Mirror, Symmetries, Symmetry, Translation
 from music_rllib.envs.make import Env, augmentation_of, compute_reward_of, make_env
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.replay.trajectories import Floats, ReplayLayout, Transitions
@@ -89,6 +89,12 @@ def test_entries_beyond_a_vector_are_refused(symmetries: dict[str, Any], message
     declared = Symmetries.model_validate(symmetries)
     with pytest.raises(ValueError, match=message):
         Augmentation(declared, declared.kinds, LAYOUT)
+
+
+def test_a_symmetry_that_is_not_declared_is_refused() -> None:
+    used: tuple[Symmetry, ...] = ("mirror", "translate")
+    with pytest.raises(ValueError, match="must have the symmetry translate to use it"):
+        Augmentation(Symmetries(mirror=MIRROR), used, LAYOUT)
 
 
 def layout_of(env: Env) -> ReplayLayout:
