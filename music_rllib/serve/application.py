@@ -129,7 +129,8 @@ class PolicyServer:
 def _stay_on_loopback() -> None:
     """Make this replica listen on loopback only, if Ray's node does.
 
-    Serve opens a port for calls between deployments on all addresses, and has no setting for it.
+    Ray Serve 2.60 opens a port for calls between deployments on `[::]`. It has no setting for it:
+    `HTTPOptions.host` and its environment variables are about the proxy only.
     """
     address = ray.util.get_node_ip_address()
     if ip_address(address).is_loopback:

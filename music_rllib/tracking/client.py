@@ -31,6 +31,7 @@ from mlflow.version import VERSION
 from music_rllib import names
 from music_rllib.errors import TrackingError
 from music_rllib.redaction import redact
+from music_rllib.runtime.process import without_collections
 from music_rllib.tracking.policy_model import MODEL_NAME, write_model
 from music_rllib.tracking.store import TrackingStore, empty_database, keep_empty_database
 
@@ -378,7 +379,7 @@ def open_client(store: TrackingStore) -> MlflowClient:
         return MlflowClient(store.uri)
     try:
         store.database.parent.mkdir(parents=True, exist_ok=True)
-        with FileLock(f"{store.database}.lock", timeout=SCHEMA_SECONDS):
+        with FileLock(f"{store.database}.lock", timeout=SCHEMA_SECONDS), without_collections():
             is_new = not store.database.exists()
             if is_new:
                 with contextlib.suppress(OSError, RuntimeError):

@@ -250,5 +250,5 @@ def _training_run() -> type[TrainingRun]:
     """The class; importing its libraries takes seconds."""
     with without_collections():
         from music_rllib.training.run import TrainingRun
-
-        return TrainingRun
+    gc.freeze()  # 0.2 s less for the collection after each run
+    return TrainingRun
