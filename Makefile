@@ -10,8 +10,9 @@ PYTEST_ARGS ?=
 SECONDS ?= 600
 SEED    ?= 0
 # The tests of a file stay together and share what they set up; tests/conftest.py orders the files.
-JOBS   ?= 2
-PYTEST := $(BIN)/python -m pytest -n $(JOBS) --dist loadscope --no-loadscope-reorder
+# Three keep two cores busy, because sweeps wait for their processes; quick tests wait for nothing.
+JOBS   ?= 3
+PYTEST = $(BIN)/python -m pytest -n $(JOBS) --dist loadscope --no-loadscope-reorder
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
@@ -56,6 +57,7 @@ sweep: venv  ## train the packaged sweep and write its report (minutes)
 test: venv  ## run the whole suite (CI=true: a missing service is a failure, not a skip)
 	@$(PYTEST) $(PYTEST_ARGS)
 
+test-unit: JOBS = 2
 test-unit: venv  ## run the quick tests (about a minute)
 	@$(PYTEST) tests/unit $(PYTEST_ARGS)
 

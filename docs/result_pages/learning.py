@@ -96,7 +96,7 @@ def _shifted(sweep: Sweep, found: Curve | None) -> Curve:
     assert found is not None, "runs of a complete study have been evaluated"
     own, whole = (
         one.least_budget(found.task, found.condition.runs)
-        for one in (sweep, with_pretraining(sweep))
+        for one in (sweep, with_pretraining(replace(sweep, history={})))
     )
     return replace(found, steps=found.steps + whole - own)
 

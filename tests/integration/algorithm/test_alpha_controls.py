@@ -14,7 +14,7 @@ from ray.rllib.policy.sample_batch import MultiAgentBatch, SampleBatch
 
 from music_rllib import names
 from music_rllib.functional.entropy_scale import matched_alpha, normalised_alpha
-from music_rllib.tac.algorithm import TACConfig
+from music_rllib.tac.algorithm import TACConfig, _determinism_without_compiler
 from music_rllib.tac.learner import TACLearner
 
 ACTIONS, BATCH = 2, 32
@@ -27,7 +27,8 @@ def learner(**settings: Any) -> TACLearner:
     small = {"hidden_sizes": (16, 16), "batch_size": BATCH, "random_steps": 0, "lr": 2e-2}
     config.training(**{**small, "tau": 0.05, "normalise_observations": False, **settings})
     config.environment(observation_space=spaces[0], action_space=spaces[1])
-    built: TACLearner = config.build_learner(spaces={DEFAULT_MODULE_ID: spaces})
+    with _determinism_without_compiler():
+        built: TACLearner = config.build_learner(spaces={DEFAULT_MODULE_ID: spaces})
     return built
 
 

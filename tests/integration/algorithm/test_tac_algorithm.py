@@ -400,7 +400,9 @@ def test_q_bias_equals_its_definition() -> None:
 
 
 def test_remote_runners_and_learner_learn_and_resume_like_local_ones(tmp_path: Path) -> None:
-    algo = build(music=MUSIC_U, where={"num_env_runners": 1, "num_learners": 1})
+    """And a bad reward stops them, too."""
+    register_spoilt(530)
+    algo = build("Spoilt", music=MUSIC_U, where={"num_env_runners": 1, "num_learners": 1})
     first = [algo.train() for _ in range(3)][-1]
     assert first["env_runners"]["num_env_steps_sampled_lifetime"] == 300
     assert np.isfinite(first["learners"]["default_policy"]["loss/critics"])
@@ -417,7 +419,7 @@ def test_remote_runners_and_learner_learn_and_resume_like_local_ones(tmp_path: P
     assert after[0] == after[1]
     assert after[0][0] != before
     assert after[0][1:] == (400, 60)
-    algo.stop()
+    check_that_a_bad_reward_stops(algo)
 
 
 def register_uneven() -> None:
@@ -467,8 +469,9 @@ def test_the_bound_on_fresh_episodes_is_taken_over_all_of_them(tmp_path: Path) -
     assert fingerprint(resumed, 1) == fingerprint(algo, 1)
 
 
-@pytest.mark.parametrize("runners", [0, 1])
-def test_a_bad_reward_stops_training_and_never_reaches_the_replay(runners: int) -> None:
+def register_spoilt(step: int) -> None:
+    """Register `Spoilt`: FetchReach whose reward is NaN once, at the step of that number."""
+
     def spoilt(context: Any) -> gym.Env[Any, Any]:
         class Spoilt(gym.Wrapper[Any, Any, Any, Any]):
             steps = 0
@@ -476,22 +479,33 @@ def test_a_bad_reward_stops_training_and_never_reaches_the_replay(runners: int) 
             def step(self, action: Any) -> Any:
                 observation, reward, *rest = self.env.step(action)
                 self.steps += 1
-                return observation, float("nan") if self.steps == 130 else reward, *rest
+                return observation, float("nan") if self.steps == step else reward, *rest
 
         return Spoilt(make_env("FetchReach-v4"))
 
     tune.register_env("Spoilt", spoilt)
-    algo = build("Spoilt", where={"num_env_runners": runners})
-    for _ in range(2):
-        algo.train()
-    weights = weight_sums(algo)
+
+
+def check_that_a_bad_reward_stops(algo: TAC) -> None:
+    """Train until it comes: it reaches neither the replay nor the weights."""
+    seen = []
+
+    def train() -> None:
+        while True:
+            seen.append((algo.replay.trajectories, weight_sums(algo)))
+            algo.train()
+
     with pytest.raises(BadNumberError, match=r"^FetchReach-v4, sub-env.* step 30: reward is nan"):
-        algo.train()
-    assert algo.replay.trajectories == 4
+        train()
+    assert (algo.replay.trajectories, weight_sums(algo)) == seen[-1]
     assert np.isfinite(algo.replay.packed(0)["rewards"]).all()
-    assert weight_sums(algo) == weights
     algo.stop()
     assert not Path(algo.logdir).exists()
+
+
+def test_a_bad_reward_stops_training_and_never_reaches_the_replay() -> None:
+    register_spoilt(130)
+    check_that_a_bad_reward_stops(build("Spoilt"))
 
 
 @pytest.mark.parametrize(

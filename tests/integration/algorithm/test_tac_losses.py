@@ -12,7 +12,7 @@ from ray.rllib.core import DEFAULT_MODULE_ID
 from torch import Tensor
 
 from music_rllib import names
-from music_rllib.tac.algorithm import TACConfig
+from music_rllib.tac.algorithm import TACConfig, _determinism_without_compiler
 from music_rllib.tac.diagnostics import NonFiniteLossError, of_updates
 from music_rllib.tac.learner import TACLearner
 
@@ -29,7 +29,8 @@ def learner(**settings: Any) -> TACLearner:
         **{"hidden_sizes": (16, 16), "batch_size": BATCH, "random_steps": 0, **settings}
     )
     config.environment(observation_space=spaces[0], action_space=spaces[1])
-    built: TACLearner = config.build_learner(spaces={DEFAULT_MODULE_ID: spaces})
+    with _determinism_without_compiler():
+        built: TACLearner = config.build_learner(spaces={DEFAULT_MODULE_ID: spaces})
     built.module[DEFAULT_MODULE_ID].double()
     return built
 
