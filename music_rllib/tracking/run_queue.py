@@ -67,7 +67,6 @@ class RunQueue:
         self._cancelled = False
         self._is_new = self._has_begun = False
         """Whether this process created the run, which has no params yet; or has begun it."""
-        self._policy: Record = self._send_policy
         self._read_policy: Callable[[], bytes | None] | None = None
 
     # -- adding to the queue -----------------------------------------------------------------
@@ -93,7 +92,7 @@ class RunQueue:
         """The run is in the store: the result of `read` replaces all records in the queue."""
         with self._lock:
             self._info, self._ended = info, True
-            self._records = deque([partial(self._send_stored, read), self._policy])
+            self._records = deque([partial(self._send_stored, read), self._send_policy])
 
     def keep_current(self, node_keys: Iterable[str]) -> None:
         """The sweep, whose parent run this is, has the runs of these nodes and no others."""
@@ -114,11 +113,6 @@ class RunQueue:
     def is_running(self) -> bool:
         """Whether the run has started and not ended."""
         return not self._ended
-
-    @property
-    def run_id(self) -> str | None:
-        """The run's id in MLflow; None until it is known."""
-        return self._run.run_id if self._run else self._experiment.known_id(self.node_key)
 
     @property
     def source(self) -> str | None:
@@ -148,7 +142,7 @@ class RunQueue:
         """
         with contextlib.suppress(_Cancelled):
             while not self._cancelled and (records := self._next()):
-                if (first := records[0]) is self._policy and not policy:
+                if (first := records[0]) == self._send_policy and not policy:
                     return
                 if callable(first):
                     first()

@@ -21,6 +21,7 @@ from tempfile import TemporaryDirectory
 from types import TracebackType
 from typing import Self
 from urllib.parse import urlencode
+from weakref import WeakValueDictionary
 
 import yaml
 
@@ -88,7 +89,8 @@ class Tracker:
         """
         self.store = resolve_store(tracking_uri, storage)
         check_reachable(self.store)
-        self._runs: dict[str, RunQueue] = {}
+        self._runs: WeakValueDictionary[str, RunQueue] = WeakValueDictionary()
+        """By node key; the sender keeps each until its run has ended and is delivered."""
         self._undelivered: Pending | None = None
         self._view: dict[str, str] = {}
         self._name, self._place = sweep_name, below(redact(storage), sweep_name)
@@ -127,8 +129,9 @@ class Tracker:
 
     def log(self, node_key: str, reports: Sequence[Report]) -> None:
         """Log reports of a started run."""
-        self._runs[node_key].report(reports)
-        self._sender.add(self._runs[node_key])
+        queue = self._runs[node_key]
+        queue.report(reports)
+        self._sender.add(queue)
 
     def end(self, node_key: str, status: Status, tags: Mapping[str, str] | None = None) -> None:
         """End a started run that has no result in the store; `tags` say why.
@@ -136,8 +139,9 @@ class Tracker:
         The status of a stopped run that can be resumed is KILLED.
         """
         short = {key: redact(value)[:MAX_CAUSE_LENGTH] for key, value in (tags or {}).items()}
-        self._runs[node_key].end(status, short)
-        self._sender.add(self._runs[node_key])
+        queue = self._runs[node_key]
+        queue.end(status, short)
+        self._sender.add(queue)
 
     def mirror(self, run: RunInfo, read: Callable[[], StoredRun]) -> None:
         """Log a finished run of the store, from this sweep or an earlier one.
@@ -177,12 +181,12 @@ class Tracker:
 
     def is_running(self, node_key: str) -> bool:
         """Whether a run was started and has not ended."""
-        return node_key in self._runs and self._runs[node_key].is_running
+        queue = self._runs.get(node_key)
+        return queue is not None and queue.is_running
 
     def run_id(self, node_key: str) -> str | None:
         """MLflow's id of a run; None until the server has the run."""
-        queue = self._runs.get(node_key)
-        return None if queue is None else queue.run_id
+        return self._experiment.known_id(node_key)
 
     def keep_view(self, content: str, versions: Sequence[str]) -> None:
         """Save a view for `comparison_url`, if MLflow has one of these versions.
@@ -277,10 +281,10 @@ class Tracker:
         return parent
 
     def _queue(self, node_key: str) -> RunQueue:
-        if node_key not in self._runs:
+        if (queue := self._runs.get(node_key)) is None:
             tags = {names.TAG_SWEEP: self._name, names.TAG_PARENT_RUN: self.parent_run_id}
-            self._runs[node_key] = RunQueue(self._experiment, node_key, tags)
-        return self._runs[node_key]
+            queue = self._runs[node_key] = RunQueue(self._experiment, node_key, tags)
+        return queue
 
 
 @dataclass(frozen=True, kw_only=True)

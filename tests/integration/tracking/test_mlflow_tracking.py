@@ -189,6 +189,10 @@ def test_a_sweep_as_mlflow_shows_it(storage: Path, tracker_on: MakeTracker) -> N
     tracker.end("fine", "FAILED", {names.TAG_FAILURE: cause})
     assert tracker.flush(20.0)
     assert tracker.run_id("fine") is not None
+    deadline = time.monotonic() + 20
+    while tracker._runs:
+        assert time.monotonic() < deadline, "delivered runs stay in memory"
+        time.sleep(0.05)
     assert not tracker.close("FAILED")
 
     client = client_of(storage)
