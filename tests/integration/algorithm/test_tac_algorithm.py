@@ -19,6 +19,7 @@ from music_rllib import TACConfig, names
 from music_rllib.config.run_settings import ReplaySettings
 from music_rllib.config.tac_settings import TACSettings
 from music_rllib.envs.make import make_env
+from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.envs.values import BadNumberError
 from music_rllib.intrinsic.music import HELD_OUT_STEPS
 from music_rllib.intrinsic.settings import IntrinsicSettings, MusicSettings
@@ -90,7 +91,8 @@ def build(
     )
     config.reporting(min_sample_timesteps_per_iteration=1)
     config.training(**{**SMALL, "total_env_steps": 1_000, **settings})
-    config.replay(**{"capacity": 10_000, **replay})
+    symmetries = BUILT_IN_TASKS["FetchReach"].symmetries
+    config.replay(**{"capacity": 10_000, "task_symmetries": symmetries, **replay})
     if music is not None:
         config.music(agent_indices=range(3), surrounding_indices=range(3, 6), **music)
     config.evaluation(evaluation_interval=10**9, evaluation_duration=2)
@@ -234,6 +236,7 @@ CHANGES: dict[str, tuple[Any, dict[str, Any]]] = {
     "replay.hindsight_episodes": ("moved", {}),
     "replay.hindsight_goals": ("final", {}),
     "replay.n_steps": (3, {"music.estimator": "none", "music.mi_reward_weight": 0.0}),
+    "replay.symmetries": (("mirror",), {}),
     "replay.priority": ("td_error", {}),
     "replay.priority_exponent": (1.0, PER),
     "replay.importance_exponent": (1.0, PER),
@@ -293,6 +296,7 @@ def test_no_setting_is_dead(setting: str, bases: dict[str, dict[str, float]]) ->
 NOISE_AND_STEPS: dict[str, Any] = {
     "behaviour": {"kind": "colored_noise", "random_share": 0.3},
     "replay.n_steps": 3,
+    "replay.symmetries": ("mirror", "translate"),
 }
 REDQ: dict[str, Any] = {
     "bootstrap": "critics",
@@ -316,7 +320,7 @@ REDQ: dict[str, Any] = {
     ids=[
         "ddpg",
         "sac",
-        "per, colored noise, three steps",
+        "per, colored noise, three steps, symmetries",
         "drawn quantile critics, delayed policy",
         "e3b",
     ],
