@@ -39,39 +39,55 @@ def test_tac_improves_pendulum_clearly_over_a_random_policy() -> None:
     assert trained > -500
 
 
-def music_u(**settings: Any) -> RunSettings:
-    task = BUILT_IN_TASKS["FetchPush"]
-    tac = {
-        "hidden_sizes": (128, 128),
-        "alpha": 0.02,
-        "gamma": 0.95,
-        "tau": 0.05,
-        "replay_ratio": 0.4,
-        "behaviour": {"kind": "gaussian_noise"},
-    }
-    return RunSettings(
-        task=task,
-        variant="music-u",
-        tac=tac,
-        music={**variant_music("music-u", task), "batch_trajectories": 32},
-        env_steps=12_000,
-        evaluation={"interval": 12_000, "episodes": 20},
-        **settings,
+def reports_of(task: str, env_steps: int, seed: int, **tac: Any) -> list[dict[str, float]]:
+    """Reports of a run of MUSIC-u with changed settings of TAC."""
+    settings = RunSettings.model_validate(
+        {
+            "task": BUILT_IN_TASKS[task],
+            "variant": "music-u",
+            "seed": seed,
+            "tac": {"alpha": 0.02, "gamma": 0.95, "tau": 0.05} | tac,
+            "music": {**variant_music("music-u", BUILT_IN_TASKS[task]), "batch_trajectories": 32},
+            "env_steps": env_steps,
+            "evaluation": {"interval": env_steps, "episodes": 20},
+        }
     )
-
-
-def test_music_u_learns_to_move_the_object_and_to_measure_it() -> None:
-    # One seed in eight needs longer; rounding on the CPU decides which one. Two in a row rarely do.
-    if not learns_to_move_and_measure(music_u(seed=1)):
-        assert learns_to_move_and_measure(music_u(seed=2))
-
-
-def learns_to_move_and_measure(settings: RunSettings) -> bool:
     run = TrainingRun(settings)
     reports = []
     while not run.finished:
         reports.append(run.advance())
     run.close()
+    return reports
+
+
+def test_music_u_learns_to_move_the_object_and_to_measure_it() -> None:
+    """Without a simulator, in seconds."""
+    last = reports_of(
+        "PointCarry",
+        3_000,
+        seed=1,
+        hidden_sizes=(64, 64),
+        random_steps=400,
+        replay_ratio=1.0,
+        behaviour={"kind": "gaussian_noise", "std": 0.2, "random_share": 0.3},
+    )[-1]
+    # Eight seeds ended at 0.93 to 1.27 nats and 0.47 to 0.87 m; three with a learning rate of 1e-12
+    # at 0.27 nats and 0.15 m at most.
+    assert last[names.HELD_OUT_BOUND] > 0.6
+    assert last[names.TRAIN_DISPLACEMENT] > 0.3
+
+
+@pytest.mark.thorough
+def test_music_u_learns_to_push_and_to_measure_it() -> None:
+    # One seed in eight needs longer; rounding on the CPU decides which one. Two in a row rarely do.
+    if not learns_to_push_and_measure(seed=1):
+        assert learns_to_push_and_measure(seed=2)
+
+
+def learns_to_push_and_measure(seed: int) -> bool:
+    noise = {"kind": "gaussian_noise"}
+    shape: dict[str, Any] = {"hidden_sizes": (128, 128), "replay_ratio": 0.4}
+    reports = reports_of("FetchPush", 12_000, seed, **shape, behaviour=noise)
     # Its first thousand steps are those of a random policy.
     random_displacement = reports[1][names.TRAIN_DISPLACEMENT]
     late = reports[-4:]

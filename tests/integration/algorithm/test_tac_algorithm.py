@@ -207,7 +207,7 @@ CHANGES: dict[str, tuple[Any, dict[str, Any]]] = {
     "bootstrap": ("critics", {}),
     "policy_critic": ("first", {}),
     "critics": (3, {}),
-    "target_critics": (1, {}),
+    "target_critics": (2, {"critics": 3}),
     "quantiles": (5, {"bootstrap": "critics"}),
     "dropped_quantiles": (1, {"bootstrap": "critics", "quantiles": 5}),
     "policy_delay": (2, {}),
