@@ -246,9 +246,9 @@ def _measure(console: Console, opened: OpenSweep) -> dict[str, Any]:
     from music_rllib.sweep.views import cost
 
     left = cost.run_groups(opened.config, opened.plan, opened.finished)
-    costs, slots = cost.measure(opened.config, left, console.print)
-    console.print(cost.cost_view(costs, slots))
-    return cost.cost_document(costs, slots)
+    measured = cost.measure(opened.config, left, console.print)
+    console.print(cost.cost_view(measured))
+    return measured
 
 
 def _stopped_early(console: Console, stopped: KeyboardInterrupt | SystemExit) -> int:

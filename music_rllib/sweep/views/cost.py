@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -128,29 +128,10 @@ def _points_of(search: SearchSettings, stage: str) -> int:
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Cost:
-    """A group of runs, and the measurement of a short run of it."""
-
-    group: RunGroup
-    sample: RunSample
-
-    @property
-    def seconds(self) -> float:
-        """Time of one whole run, from its start to its end."""
-        group, sample = self.group, self.sample
-        evaluations = 1 + math.ceil(group.env_steps / group.settings.evaluation.interval)
-        training = group.env_steps / sample.steps_per_second
-        return sample.start_seconds + training + evaluations * sample.evaluation_seconds
-
-
 def measure(
     config: SweepConfig, groups: Collection[RunGroup], say: Callable[[str], None]
-) -> tuple[list[Cost], int]:
-    """Train runs of each group for some seconds, as many side by side as fit.
-
-    Returns:
-        The cost of each group, and how many runs fit at once.
+) -> dict[str, Any]:
+    """Train runs of each group for some seconds, as many side by side as fit; their `cost_of`.
 
     Raises:
         ClusterError: Ray can't be reached or can't hold a run.
@@ -162,43 +143,46 @@ def measure(
     with cluster(config.resources) as room:
         if room.remark is not None:
             say(room.remark)
-        costs = []
+        samples = []
         for number, group in enumerate(groups, 1):
             say(f"measuring {number} of {len(groups)}: {group.label}")
             run = group.settings.model_copy(update={"env_steps": group.env_steps})
             sample = sample_run(run, config.resources, min(room.at_once, max(group.runs, 1)))
-            costs.append(Cost(group=group, sample=sample))
-        return costs, room.at_once
+            samples.append((group, sample))
+        return cost_of(samples, room.at_once)
 
 
-def cost_document(costs: Sequence[Cost], slots: int) -> dict[str, Any]:
-    """The cost as plain data; times in seconds, memory in bytes."""
-    rows: list[dict[str, Any]] = [
-        {
-            "label": cost.group.label,
-            "runs": cost.group.runs,
-            "env_steps": cost.group.env_steps,
-            "grad_updates": cost.group.grad_updates,
-            "env_steps_per_second": cost.sample.steps_per_second,
-            "start_seconds": cost.sample.start_seconds,
-            "evaluation_seconds": cost.sample.evaluation_seconds,
-            "memory": cost.sample.memory,
-            "seconds_a_run": cost.seconds,
-            "seconds": cost.seconds * cost.group.runs,
-        }
-        for cost in costs
-    ]
+def cost_of(samples: Sequence[tuple[RunGroup, RunSample]], slots: int) -> dict[str, Any]:
+    """The cost of runs that train `slots` at a time; times in seconds, memory in bytes."""
+    rows: list[dict[str, Any]] = []
+    for group, sample in samples:
+        evaluations = 1 + math.ceil(group.env_steps / group.settings.evaluation.interval)
+        training = group.env_steps / sample.steps_per_second
+        seconds = sample.start_seconds + training + evaluations * sample.evaluation_seconds
+        rows.append(
+            {
+                "label": group.label,
+                "runs": group.runs,
+                "env_steps": group.env_steps,
+                "grad_updates": group.grad_updates,
+                "env_steps_per_second": sample.steps_per_second,
+                "start_seconds": sample.start_seconds,
+                "evaluation_seconds": sample.evaluation_seconds,
+                "memory": sample.memory,
+                "seconds_a_run": seconds,
+                "seconds": seconds * group.runs,
+            }
+        )
     alone = sum(row["seconds"] for row in rows)
-    longest = max((cost.seconds for cost in costs), default=0.0)
+    longest = max((row["seconds_a_run"] for row in rows), default=0.0)
     return {"kinds": rows, "runs_at_once": slots, "seconds": max(alone / slots, longest)}
 
 
-def cost_view(costs: Sequence[Cost], slots: int) -> Group:
+def cost_view(cost: Mapping[str, Any]) -> Group:
     """One row for each group of runs; the total time and memory below."""
-    document = cost_document(costs, slots)
     heads = ("stage/task", "runs", "env steps", "steps/s", "memory", "start", "one run", "all")
     table = new_table("Cost on this machine", heads, left=["stage/task"])
-    for row in document["kinds"]:
+    for row in cost["kinds"]:
         table.add_row(
             row["label"],
             f"{row['runs']:,}",
@@ -209,9 +193,10 @@ def cost_view(costs: Sequence[Cost], slots: int) -> Group:
             clock(row["seconds_a_run"]),
             clock(row["seconds"]),
         )
+    slots = cost["runs_at_once"]
     at_once = "one run at a time" if slots == 1 else f"{slots} runs at a time, as measured"
-    largest = max((cost.sample.memory for cost in costs), default=0)
-    lines = [f"About {clock(document['seconds'])} with {at_once}.", _memory_text(largest, slots)]
+    largest = max((row["memory"] for row in cost["kinds"]), default=0)
+    lines = [f"About {clock(cost['seconds'])} with {at_once}.", _memory_text(largest, slots)]
     load = os.getloadavg()[0]
     if load > BUSY_LOAD * len(os.sched_getaffinity(0)):
         lines.append(f"Other programs used the machine (load {load:.1f}).")

@@ -86,18 +86,18 @@ SAMPLE = RunSample(
 )
 
 
-def costs(folder: Path) -> list[cost.Cost]:
-    return [cost.Cost(group=group, sample=SAMPLE) for group in kinds(folder)]
+def costs(folder: Path, slots: int) -> dict[str, Any]:
+    return cost.cost_of([(group, SAMPLE) for group in kinds(folder)], slots)
 
 
 def test_the_time_is_training_evaluations_and_start(tmp_path: Path) -> None:
     # 10,000 steps, an evaluation every 5,000 and one before them.
     a_run = 100.0 + 3 * 3.0 + 5.0
-    document = cost.cost_document(costs(tmp_path), slots=4)
+    document = costs(tmp_path, slots=4)
     assert document["seconds"] == pytest.approx(16 * a_run / 4)
     assert document["kinds"][0]["seconds"] == pytest.approx(4 * a_run)
-    assert cost.cost_document(costs(tmp_path), slots=100)["seconds"] == pytest.approx(a_run)
-    assert cost.cost_document([], slots=2) == {"kinds": [], "runs_at_once": 2, "seconds": 0.0}
+    assert costs(tmp_path, slots=100)["seconds"] == pytest.approx(a_run)
+    assert cost.cost_of([], slots=2) == {"kinds": [], "runs_at_once": 2, "seconds": 0.0}
 
 
 @pytest.mark.parametrize(
@@ -112,5 +112,5 @@ def test_runs_that_no_memory_holds_side_by_side_are_told_of(
 ) -> None:
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     monkeypatch.setattr(machine, "memory", lambda: here * 2**30)
-    view = cost.cost_view(costs(tmp_path), slots=4)
+    view = cost.cost_view(costs(tmp_path, slots=4))
     assert any(told in str(line) for line in view.renderables)
