@@ -196,9 +196,10 @@ def compare(
     from music_rllib.experiment.sweep_files import find_sweep
     from music_rllib.sweep.views.compare import compare_stage
 
-    compared = compare_stage(find_sweep(sweep, storage), stage, metric, minimize=minimize)
+    found = find_sweep(sweep, storage)
+    document, view = compare_stage(found, stage, metric, minimize=minimize)
     if json:
-        print_json(compared.document())
+        print_json(document)
     else:
-        console_for().print(compared.view())
+        console_for().print(view)
     return 0
