@@ -30,7 +30,6 @@ class YamlFile(NamedTuple):
     """A YAML file's content, and the line on which each of its values begins."""
 
     path: Path
-    text: str
     data: dict[str, Any]
     lines: Mapping[KeyPath, int]
 
@@ -56,7 +55,7 @@ def read_yaml(path: Path) -> YamlFile:
         raise ConfigError([f"{path.name}{line}: {_rule(error)}"]) from None
     if not isinstance(data, dict):
         raise ConfigError([f"{path.name}: must be a mapping of keys to values at its top"])
-    return YamlFile(path, text, data, MappingProxyType(lines))
+    return YamlFile(path, data, MappingProxyType(lines))
 
 
 def read_value(text: str) -> Any:
