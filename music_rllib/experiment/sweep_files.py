@@ -70,15 +70,16 @@ class SweepLocation:
         return sweep_folder(self.storage, self.name)
 
     @cached_property
-    def _files(self) -> StorageFolder:
+    def files(self) -> StorageFolder:
+        """The folder of its files in the storage."""
         return open_storage(self.storage) / self.name
 
     def read(self, file: str) -> Any:
         """The content of a JSON file; None if it does not exist."""
-        return read_json(self._files, file)
+        return read_json(self.files, file)
 
     def write(self, file: str, text: str) -> None:
-        self._files.write(file, text.encode())
+        self.files.write(file, text.encode())
 
     def keep(self, file: str, text: str) -> None:
         """Write a file into the storage, and if that is a bucket, to this machine too."""

@@ -129,7 +129,7 @@ def _add_own_files(location: SweepLocation, storage: StorageFolder, cleaning: Cl
 
 
 def _is_driven(location: SweepLocation, state: Mapping[str, Any] | None) -> bool:
-    drivers = drivers_of(location.storage, location.name, watch=True)
+    drivers = drivers_of(location, watch=True)
     return sweep_files.is_alive(state) or bool(drivers)
 
 

@@ -139,11 +139,11 @@ def run(
         )
         be_patient(config.resources.storage_minutes, warn)
         with (
-            driving(opened.storage, config.name) as drivers,
+            driving(opened.location) as drivers,
             contextlib.ExitStack() as stack,
             early,
         ):
-            with alone(opened.storage, config.name, partial(_say, console)) as waited:
+            with alone(opened.location, partial(_say, console)) as waited:
                 if opened.damaged or again:
                     drivers.check_alone()
                 if waited:

@@ -14,20 +14,20 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from music_rllib.errors import BadInputError
+from music_rllib.experiment.sweep_files import SweepLocation
 from music_rllib.store.lease import HeldLease, Lease, LeaseFile
-from music_rllib.store.storage import open_storage
 
 FILE, DRIVERS = "driver.json", "drivers"
 WAIT_SECONDS = 1.0
 """Time between two attempts to get `driver.json`."""
 
 
-def drivers_of(storage: str, name: str, *, watch: bool = False) -> list[Lease]:
+def drivers_of(location: SweepLocation, *, watch: bool = False) -> list[Lease]:
     """The leases of the processes that drive a sweep.
 
     `watch` looks for up to a minute at leases that a fast clock has dated ahead.
     """
-    folder = open_storage(storage) / name / DRIVERS
+    folder = location.files / DRIVERS
     files = [LeaseFile(folder, file) for file in folder.files() if not file.startswith(".")]
     return [lease for file in files if (lease := file.holder(watch=watch)) is not None]
 
@@ -36,14 +36,13 @@ def drivers_of(storage: str, name: str, *, watch: bool = False) -> list[Lease]:
 class Drivers:
     """The drivers of a sweep, from the view of one of them."""
 
-    storage: str
-    name: str
+    location: SweepLocation
     owner: str
     """Owner of this driver's lease."""
 
     def others(self, *, watch: bool = False) -> list[Lease]:
         """The leases of all other drivers."""
-        leases = drivers_of(self.storage, self.name, watch=watch)
+        leases = drivers_of(self.location, watch=watch)
         return [lease for lease in leases if lease.owner != self.owner]
 
     def check_alone(self) -> None:
@@ -55,19 +54,20 @@ class Drivers:
         if others := self.others(watch=True):
             raise BadInputError(
                 "--retrain, --retrain-damaged and --accept-changes delete results and must be "
-                f"given while no other process runs {self.name}, got {others[0]}: stop it first"
+                f"given while no other process runs {self.location.name}, got {others[0]}: stop "
+                "it first"
             )
 
 
 @contextlib.contextmanager
-def alone(storage: str, name: str, say: Callable[[str], None]) -> Iterator[bool]:
+def alone(location: SweepLocation, say: Callable[[str], None]) -> Iterator[bool]:
     """Hold the lease `driver.json`; yields whether it had to wait for another process.
 
     Raises:
         StorageError: The storage can't be written.
     """
-    file = LeaseFile(open_storage(storage) / name, FILE)
-    lease, waited = Lease.of_this_process(f"sweep {name!r}"), False
+    file = LeaseFile(location.files, FILE)
+    lease, waited = Lease.of_this_process(f"sweep {location.name!r}"), False
     while (holder := file.acquire(lease)) is not None:
         if not waited:
             say(f"waits for {holder}, which prepares or ends")
@@ -82,17 +82,17 @@ def alone(storage: str, name: str, say: Callable[[str], None]) -> Iterator[bool]
 
 
 @contextlib.contextmanager
-def driving(storage: str, name: str) -> Iterator[Drivers]:
+def driving(location: SweepLocation) -> Iterator[Drivers]:
     """Hold the lease of a driver.
 
     Raises:
         StorageError: The storage can't be written.
     """
-    lease = Lease.of_this_process(f"sweep {name!r}")
-    file = LeaseFile(open_storage(storage) / name / DRIVERS, f"{lease.owner}.json")
+    lease = Lease.of_this_process(f"sweep {location.name!r}")
+    file = LeaseFile(location.files / DRIVERS, f"{lease.owner}.json")
     file.acquire(lease)
     held = HeldLease(file, lease)
     try:
-        yield Drivers(storage, name, lease.owner)
+        yield Drivers(location, lease.owner)
     finally:
         held.release()

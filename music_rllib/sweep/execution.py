@@ -9,7 +9,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from socket import gethostname
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +24,7 @@ from music_rllib.experiment.sweep_files import SEARCH, as_json
 from music_rllib.redaction import redact
 from music_rllib.runtime.machine import cluster_address
 from music_rllib.runtime.process import give_back_freed_memory, try_for, without_collections
-from music_rllib.store.storage import below, is_remote, sweep_folder
+from music_rllib.store.storage import is_remote
 from music_rllib.sweep.driver_lock import Drivers, alone
 from music_rllib.sweep.listeners.mlflow_view import VERSIONS, comparison_view
 from music_rllib.sweep.listeners.prometheus import PrometheusListener
@@ -107,8 +106,8 @@ def compute_and_report(
         console.print(f"Sending to MLflow: {records:,} records left (Ctrl-C to send them later)")
 
     # A stopped driver does not wait for the report of another one.
-    storage, config, report = opened.storage, opened.config, None
-    with contextlib.nullcontext() if stopped_by else alone(storage, config.name, display.say):
+    report = None
+    with contextlib.nullcontext() if stopped_by else alone(opened.location, display.say):
         if not drivers.others():
             mlflow_log.log_postponed()
         tracker.close(
@@ -117,8 +116,7 @@ def compute_and_report(
         )
         _show_results(console, opened, tracker, state_file, searches)
         if not stopped_by:
-            uri = config.mlflow.tracking_uri
-            report = report_at_end(storage, config.name, uri, config.path)
+            report = report_at_end(opened)
     if lost:
         console.print(
             f"{lost} trials failed because a run of theirs failed. This study does not try them "
@@ -261,11 +259,10 @@ TIMEOUT_SECONDS = 900.0
 """After this time the sweep ends without a report."""
 
 
-def report_at_end(storage: str, name: str, tracking_uri: str | None, config: Path) -> str | None:
+def report_at_end(opened: OpenSweep) -> str | None:
     """Make the report of a sweep and attach it to the sweep's run in MLflow.
 
     It runs in a process of its own: whatever happens in it, the results of the sweep are kept.
-    `config` is the sweep's YAML file, whose environments are recorded in videos.
 
     Returns:
         A message with the paths of the page and its picture, or with the reason why there is no
@@ -273,16 +270,16 @@ def report_at_end(storage: str, name: str, tracking_uri: str | None, config: Pat
     """
     if os.environ.get(names.VARIABLE_REPORT, "").lower() in {"off", "0", "no", "false"}:
         return None
-    environment = dict(os.environ)
-    if tracking_uri is not None:
-        environment[names.VARIABLE_TRACKING_URI] = tracking_uri
-    place = str(sweep_folder(storage, name))
-    if is_remote(storage):
+    config, remote, environment = opened.config, is_remote(opened.storage), dict(os.environ)
+    if config.mlflow.tracking_uri is not None:
+        environment[names.VARIABLE_TRACKING_URI] = config.mlflow.tracking_uri
+    place = config.name if remote else str(opened.folder)
+    if remote:
         # Its URI may hold a key, which everyone on the machine could read on a command line.
-        environment[names.VARIABLE_STORAGE], place = storage, name
+        environment[names.VARIABLE_STORAGE] = opened.storage
     command = [sys.executable, "-m", "music_rllib", "report", place]
-    if config.is_file():
-        command += ["--env", str(config.absolute())]
+    if config.path.is_file():  # its environments are recorded in videos
+        command += ["--env", str(config.path.absolute())]
     try:
         done = subprocess.run(  # noqa: S603
             [*command, "--attach"],
@@ -298,13 +295,12 @@ def report_at_end(storage: str, name: str, tracking_uri: str | None, config: Pat
         marks = ("Report: ", "Picture: ")
         made = [line for line in done.stdout.splitlines() if line.startswith(marks)]
         errors = done.stderr.strip().splitlines()
-        if "RAY_JOB_CONFIG_JSON_ENV_VAR" in environment or is_remote(storage):
-            made = elsewhere(done.stdout, below(redact(storage), name))
+        if "RAY_JOB_CONFIG_JSON_ENV_VAR" in environment or remote:
+            made = elsewhere(done.stdout, opened.location.place)
         if made:  # even if it could not be attached, or if runs are damaged
             return "\n".join(made if done.returncode == 0 else [*made, *errors[-1:]])
         reason = errors[-1] if errors else f"it ended with exit code {done.returncode}"
-    place = below(redact(storage), name)
-    return f"No report: {reason}. Make it with: music-rllib report {place}"
+    return f"No report: {reason}. Make it with: music-rllib report {opened.location.place}"
 
 
 def elsewhere(output: str, sweep: str) -> list[str]:

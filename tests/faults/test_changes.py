@@ -166,19 +166,19 @@ def test_drivers_know_of_each_other_and_not_of_a_dead_one(
     tmp_path: Path, sweep_document: dict[str, Any]
 ) -> None:
     sweep = opened(tmp_path, sweep_document)
-    with driving(sweep.storage, "points") as one:
+    with driving(sweep.location) as one:
         one.check_alone()
-        with driving(sweep.storage, "points") as other:
+        with driving(sweep.location) as other:
             assert [lease.owner for lease in one.others()] == [other.owner]
             match = rf"got sweep 'points' \(process {os.getpid()} on .*: stop it first"
             with pytest.raises(BadInputError, match=match):
                 one.check_alone()
     child = os.fork()
     if child == 0:
-        with driving(sweep.storage, "points"), alone(sweep.storage, "points", print):
+        with driving(sweep.location), alone(sweep.location, print):
             os.kill(os.getpid(), signal.SIGKILL)
     os.waitpid(child, 0)
-    with driving(sweep.storage, "points") as one, alone(sweep.storage, "points", print) as waited:
+    with driving(sweep.location) as one, alone(sweep.location, print) as waited:
         assert (one.others(), waited) == ([], False)
 
 
@@ -188,13 +188,13 @@ def test_drivers_prepare_one_after_another(
     monkeypatch.setattr("music_rllib.sweep.driver_lock.WAIT_SECONDS", 0.05)
     sweep = opened(tmp_path, sweep_document)
     said: list[str] = []
-    with alone(sweep.storage, "points", said.append) as waited:
+    with alone(sweep.location, said.append) as waited:
         assert not waited
         file = LeaseFile(open_storage(sweep.storage) / "points", "driver.json")
         theirs = file.read()
         assert theirs is not None
         threading.Timer(0.2, file.release, [theirs.owner]).start()
-        with alone(sweep.storage, "points", said.append) as waited:
+        with alone(sweep.location, said.append) as waited:
             assert waited
     assert said == [f"waits for {theirs}, which prepares or ends"]
 

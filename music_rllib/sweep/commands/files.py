@@ -121,7 +121,7 @@ def clean(
     location = find_sweep(sweep, storage)
     say = console_for(as_json=json).print
     # No driver may start meanwhile.
-    with alone(location.storage, location.name, say) if yes else nullcontext():
+    with alone(location, say) if yes else nullcontext():
         cleaning = find_deletable(
             location, unfinished=unfinished or everything, everything=everything
         )

@@ -138,7 +138,7 @@ def stop(
 
     state = state_of(location)["state"]
     deadline = time.monotonic() + wait
-    while state != "running" and drivers_of(location.storage, name) and time.monotonic() < deadline:
+    while state != "running" and drivers_of(location) and time.monotonic() < deadline:
         time.sleep(0.5)  # the sweep is starting
         state = state_of(location)["state"]
     was_running = state == "running"
@@ -146,7 +146,7 @@ def stop(
         location.write(sweep_files.STOP, sweep_files.as_json({"stop": time.time_ns()}))
         while state == "running" and time.monotonic() < deadline:
             time.sleep(0.5)
-            if not drivers_of(location.storage, name):
+            if not drivers_of(location):
                 state = state_of(location)["state"]
         console.print(f"{name}: {'was told to stop' if state == 'running' else 'has stopped'}")
     else:

@@ -428,7 +428,7 @@ def test_clean_is_refused_while_a_sweep_is_being_started(
 ) -> None:
     """Its state is still that of its last driver."""
     sweep = played(storage, tmp_path)
-    with driver_lock.driving(sweep.storage, "mine"):
+    with driver_lock.driving(sweep.location):
         said = program("clean", f"{storage}/mine", "--all", "--yes")
         assert (said.code, "mine is: stop it first" in said.errors) == (2, True)
         assert program("stop", f"{storage}/mine", "--wait", "0").code == 0
@@ -519,7 +519,7 @@ def test_clean_keeps_a_last_checkpoint_that_another_sweep_shares(
     (kept,) = going["kept"]
     assert kept["what"] == f"last checkpoint of {node.label}: long has it too"
     assert len(last.names()) == 1
-    longer.location._files.remove("plan.json")
+    longer.location.files.remove("plan.json")
     assert program("clean", f"{storage}/mine", "--yes").code == 0
     assert not last.names()
 
