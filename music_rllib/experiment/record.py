@@ -155,7 +155,7 @@ def changes_since(sweep: OpenSweep) -> Changes | None:
     if not recorded or not (changed or sweep.plan.searched):
         return None
     before = _last_configuration(sweep)
-    runs = {} if before is None else {node.label: node.run for node in make_plan(before).nodes}
+    runs = {node.label: node.run for node in make_plan(before).nodes} if before and changed else {}
     counts: Counter[str] = Counter()
     lost, short = [], sweep.short
     for node in changed:
@@ -195,7 +195,7 @@ def changes_since(sweep: OpenSweep) -> Changes | None:
 def _last_configuration(sweep: OpenSweep) -> SweepConfig | None:
     """The configuration of the sweep's last run; None if this version cannot read it."""
     with contextlib.suppress(BadInputError):
-        return sweep.location.config()
+        return sweep.location.config() if sweep.location.read(CONFIG) else None
     return None
 
 
