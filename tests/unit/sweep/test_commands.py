@@ -108,7 +108,7 @@ def storage(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.
     bucket = StorageFolder(pafs.PyFileSystem(pafs.FSSpecHandler(memory)), "bucket/path")
     # All are loaded by now: one that was loaded later would keep this for good.
     local = storage_module.open_storage
-    for module in (storage_module, node_store, sweep_files, open_sweep_module, clean, driver_lock):
+    for module in (storage_module, node_store, sweep_files, open_sweep_module, clean):
         monkeypatch.setattr(
             module, "open_storage", lambda uri: bucket if "://" in uri else local(uri)
         )
