@@ -22,6 +22,18 @@ def one_line(error: BaseException) -> str:
     return shorten(f"{type(error).__name__}: {message}")
 
 
+def reason_of(error: Exception) -> str:
+    """What is wrong with a file: a validation's first finding, or the first line of an error."""
+    if findings := getattr(error, "errors", None):  # of pydantic
+        finding = findings(include_url=False)[0]
+        place = ".".join(map(str, finding["loc"]))
+        text = f"{finding['msg'].replace('Input should', 'must')}, got {finding['input']!r}"
+        return shorten(f"{place} {text}".strip())
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return f"must have {error}" if isinstance(error, KeyError) else first_line(error)
+
+
 def shorten(text: str, limit: int = 300) -> str:
     """Cut a text to `limit` characters, ending with dots."""
     return text if len(text) <= limit else text[: limit - 3] + "..."

@@ -156,7 +156,6 @@ class PolicyNetwork:
         return _numbers(observation[name], name, size)
 
     def to_bytes(self) -> bytes:
-        """The content of a policy's file."""
         arrays: dict[str, npt.NDArray[Any]] = {}
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             arrays |= {f"layer.{i}.weight": weight, f"layer.{i}.bias": bias}

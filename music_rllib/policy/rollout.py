@@ -21,12 +21,10 @@ class EpisodeResult:
     """The result of one episode; None if the task does not define a value."""
 
     seed: int
-    """Seed of the environment's reset."""
     success: bool | None
     """Success at the last step, which success rates count."""
     success_any_step: bool | None
     episode_return: float
-    """Undiscounted sum of the task's rewards."""
     env_steps: int
     object_displacement: float | None
     """Distance between the surroundings' first and last state (metres in the Fetch tasks)."""

@@ -7,7 +7,8 @@ evaluations of every run; a run that failed or is still running is censored at i
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import combinations
 from typing import NamedTuple
@@ -22,7 +23,6 @@ from music_rllib.results.conditions import (
     AVERAGED,
     Condition,
     StageRuns,
-    final_scores,
     find_stages,
 )
 from music_rllib.results.data import Ints, Sweep
@@ -64,7 +64,6 @@ class Scope:
     """The task, or `ALL_TASKS`."""
     metric: str
     """Metric whose last value is the score."""
-    tasks: int
     finals: tuple[FinalScores, ...]
     """Scores of the conditions that have a seed which has finished on every task of the scope."""
     compared: tuple[FinalScores, ...]
@@ -72,7 +71,6 @@ class Scope:
 
     @property
     def pairs(self) -> tuple[tuple[FinalScores, FinalScores], ...]:
-        """Each pair of `compared`, the later condition first."""
         return tuple((second, first) for first, second in combinations(self.compared, 2))
 
 
@@ -98,7 +96,6 @@ class Curve:
     condition: Condition
     task: str
     steps: Array
-    """`[points]` environment steps."""
     values: Array
     """`[R, points]` of a metric, NaN before a run's first and after its last evaluation."""
     estimate: Estimate
@@ -126,7 +123,6 @@ class StageAnalysis:
     scopes: tuple[Scope, ...]
     times: tuple[TimeToThreshold, ...]
     entropies: Mapping[tuple[str, Condition], Entropies]
-    """Entropies by scope and condition."""
 
 
 def analyse(sweep: Sweep) -> list[StageAnalysis]:
@@ -150,19 +146,27 @@ def analyse_stage(sweep: Sweep, stage: StageRuns, metric: str | None = None) -> 
         for threshold in THRESHOLDS
         for condition in stage.conditions
     )
+    estimates = [
+        {
+            (scope.name, final.condition): final.estimate
+            for scope in stage_scopes(sweep, stage, entropy)
+            for final in scope.finals
+        }
+        for entropy in names.ENTROPIES
+    ]
+    conditions = ((scope.name, final.condition) for scope in scopes for final in scope.finals)
     return StageAnalysis(
         stage=stage,
         scopes=scopes,
         times=tuple(one for one in times if one is not None),
-        entropies=_entropies(sweep, stage, scopes),
+        entropies={key: Entropies(*(of.get(key) for of in estimates)) for key in conditions},
     )
 
 
 def stage_scopes(sweep: Sweep, stage: StageRuns, metric: str | None = None) -> tuple[Scope, ...]:
     """Final values of a stage's conditions: a scope for each task.
 
-    The first scope covers all tasks if their metric has the same unit. A seed that has not finished
-    on every task of a scope is left out of it; otherwise tasks would have unequal weights.
+    The first scope covers all tasks if their metric has the same unit.
 
     Args:
         sweep: The runs.
@@ -170,55 +174,52 @@ def stage_scopes(sweep: Sweep, stage: StageRuns, metric: str | None = None) -> t
         metric: The metric to read; None: each task's primary one.
     """
     metrics = {task: metric or sweep.primary_metric(task) for task in stage.tasks}
-    scores = {condition: final_scores(sweep, condition, metrics) for condition in stage.conditions}
-    parts = [(task, metrics[task], [column]) for column, task in enumerate(metrics)]
-    if len(parts) > 1 and len(set(metrics.values())) == 1 and parts[0][1] in AVERAGED:
-        parts.insert(0, (ALL_TASKS, parts[0][1], list(range(len(parts)))))
-    return tuple(
-        _scope(sweep, stage, name, own, {c: matrix[:, columns] for c, matrix in scores.items()})
-        for name, own, columns in parts
-    )
+    parts = {task: {task: own} for task, own in metrics.items()}
+    if len(metrics) > 1 and len(set(metrics.values())) == 1 and {*metrics.values()} <= AVERAGED:
+        parts = {ALL_TASKS: metrics, **parts}
+    scopes = []
+    for name, own in parts.items():
+        found = [_final(sweep, condition, own) for condition in stage.conditions]
+        finals = tuple(final for final in found if final is not None)
+        compared = tuple(final for final in finals if final.condition in stage.compared)
+        metric = next(iter(own.values()))
+        scopes.append(Scope(name=name, metric=metric, finals=finals, compared=compared))
+    return tuple(scopes)
 
 
-def _scope(
-    sweep: Sweep, stage: StageRuns, name: str, metric: str, scores: Mapping[Condition, Array]
-) -> Scope:
-    finals = []
-    for condition, matrix in scores.items():
-        complete = matrix[~np.isnan(matrix).any(axis=1)]
-        if len(complete):
-            episodes = sweep.episodes(condition.runs) if metric in names.EVAL_RATES else None
-            estimate = st.estimate(complete, episodes)
-            finals.append(FinalScores(condition=condition, scores=complete, estimate=estimate))
-    return Scope(
-        name=name,
-        metric=metric,
-        tasks=len(stage.tasks) if name == ALL_TASKS else 1,
-        finals=tuple(finals),
-        compared=tuple(final for final in finals if final.condition in stage.compared),
-    )
+def _final(sweep: Sweep, condition: Condition, metrics: Mapping[str, str]) -> FinalScores | None:
+    """Last values of a condition's finished runs; None without any.
 
+    A seed that has not finished on every task is left out; otherwise tasks would have unequal
+    weights.
 
-def _entropies(
-    sweep: Sweep, stage: StageRuns, scopes: Sequence[Scope]
-) -> dict[tuple[str, Condition], Entropies]:
-    shannon, tsallis = (
-        {
-            (scope.name, final.condition): final.estimate
-            for scope in stage_scopes(sweep, stage, metric)
-            for final in scope.finals
-        }
-        for metric in (names.SHANNON_ENTROPY, names.ENTROPY)
-    )
-    keys = [(scope.name, final.condition) for scope in scopes for final in scope.finals]
-    return {key: Entropies(shannon.get(key), tsallis.get(key)) for key in keys}
+    Args:
+        sweep: The runs.
+        condition: The condition.
+        metrics: Task to metric, for T tasks.
+    """
+    by_seed: defaultdict[str, dict[str, float]] = defaultdict(dict)
+    for run in condition.runs:
+        record = sweep.runs[run]
+        metric = metrics.get(record.task)
+        if metric and record.is_finished and (score := sweep.final(run, metric)) is not None:
+            by_seed[record.seed][record.task] = score
+    complete = [own for own in by_seed.values() if own.keys() == metrics.keys()]
+    if not complete:
+        return None
+    scores = np.array([[own[task] for task in metrics] for own in complete])
+    is_rate = {*metrics.values()} <= names.EVAL_RATES
+    estimate = st.estimate(scores, sweep.episodes(condition.runs) if is_rate else None)
+    return FinalScores(condition=condition, scores=scores, estimate=estimate)
 
 
 def time_to_threshold(
     sweep: Sweep, condition: Condition, task: str, threshold: float
 ) -> TimeToThreshold | None:
     """Environment steps of a condition's runs to a success rate; None if none was evaluated."""
-    passages = list(_passages(sweep, condition, task, threshold))
+    runs = (run for run in condition.runs if sweep.runs[run].task == task)
+    series = (sweep.finite(run, names.EVAL_SUCCESS) for run in runs)
+    passages = [p for one in series if (p := st.first_passage(*one, threshold)) is not None]
     if not passages:
         return None
     steps, reached = map(np.array, zip(*passages, strict=True))
@@ -230,17 +231,6 @@ def time_to_threshold(
         reached=reached,
         median=st.censored_median(steps, reached),
     )
-
-
-def _passages(
-    sweep: Sweep, condition: Condition, task: str, threshold: float
-) -> Iterator[tuple[float, bool]]:
-    """Steps of each evaluated run to the threshold, and whether it was reached."""
-    for run in condition.runs:
-        if sweep.runs[run].task == task:
-            passage = st.first_passage(*sweep.finite(run, names.EVAL_SUCCESS), threshold)
-            if passage is not None:
-                yield passage
 
 
 def curve(sweep: Sweep, condition: Condition, task: str, metric: str) -> Curve | None:

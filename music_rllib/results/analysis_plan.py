@@ -23,6 +23,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, model_validator
 from music_rllib import names
 from music_rllib.config.schema import Hypothesis, Stage, SweepConfig
 from music_rllib.config.tac_settings import setting_text
+from music_rllib.errors import reason_of
 from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.sweep_files import ANALYSIS_PLAN, SweepLocation, as_json
 from music_rllib.store.serialization import content_key
@@ -43,6 +44,7 @@ _TEST = (
     "comparisons, 5 %; finished runs only, none left out"
 )
 MOST_VERSIONS = 1000
+PLANS_TO_READ = "analysis_plan.md"
 
 Line = Annotated[str, Field(max_length=100_000, pattern=r"^[^\x00-\x1f\x7f]*$")]
 """Plans may come from strangers: text without control characters, which a terminal would obey."""
@@ -78,7 +80,6 @@ class AnalysisPlan(_Strict):
 
     @property
     def stages(self) -> frozenset[str]:
-        """Names of the stages that the hypotheses are about."""
         return _stages_of(self.hypotheses, self.stage)
 
     @property
@@ -91,7 +92,6 @@ class AnalysisPlan(_Strict):
 
     @property
     def hash(self) -> str:
-        """Hash of the content."""
         return content_key(self.model_dump(mode="json"))
 
     def is_part_of(self, other: AnalysisPlan) -> bool:
@@ -110,7 +110,6 @@ class PlanVersion(_Strict):
 
     version: int = Field(ge=1)
     recorded_ms: int = Field(ge=0, lt=2**47)
-    """Milliseconds since the epoch."""
     hash: str
     plan: AnalysisPlan
 
@@ -147,11 +146,11 @@ def as_document(versions: Sequence[PlanVersion]) -> list[dict[str, Any]]:
 
 
 def with_plan(
-    versions: Sequence[PlanVersion], plan: AnalysisPlan, now_ms: int
+    versions: tuple[PlanVersion, ...], plan: AnalysisPlan, now_ms: int
 ) -> tuple[PlanVersion, ...]:
     """Append `plan` to `versions` as a new version, unless the last version has it."""
     if versions and versions[-1].hash == plan.hash:
-        return tuple(versions)
+        return versions
     new = PlanVersion(version=len(versions) + 1, recorded_ms=now_ms, hash=plan.hash, plan=plan)
     return (*versions, new)
 
@@ -263,9 +262,6 @@ def _steps_before(config: SweepConfig, stage: Stage, task: str) -> int:
     return steps + _steps_before(config, source, own)
 
 
-PLANS_TO_READ = "analysis_plan.md"
-
-
 def plans_in(storage: str, name: str) -> tuple[PlanVersion, ...]:
     """Versions of a sweep's plan, the oldest first; empty if none was recorded.
 
@@ -277,10 +273,9 @@ def plans_in(storage: str, name: str) -> tuple[PlanVersion, ...]:
     try:
         return () if document is None else checked_plans(document)
     except ValueError as error:
-        reason = str(error).splitlines()[-1].strip()
         raise StorageError(
             f"{location.place}/{ANALYSIS_PLAN} must hold the versions of an analysis plan "
-            f"as they were recorded: {reason}"
+            f"as they were recorded: {reason_of(error)}"
         ) from error
 
 

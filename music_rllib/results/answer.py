@@ -20,8 +20,7 @@ from music_rllib.results.statistics import (
     interval_text,
     number,
     p_text,
-    seeds_for_difference,
-    seeds_for_equivalence,
+    seeds_needed,
 )
 from music_rllib.results.study import Mean, Study
 
@@ -64,7 +63,7 @@ def answer(sweep: Sweep, study: Study) -> list[str]:
     if any(claim.verdict in undecided and not claim.unfinished for claim in study.claims):
         alike = _alike(shown)
         means = [one for one in study.means if _is_alike(one, alike)]
-        sentences += filter(None, [seeds_needed(alike, means, study.family)])
+        sentences += filter(None, [power_in_words(alike, means, study.family)])
     return [*sentences, *(f"Not tested: {text}." for text in study.untested[:1])]
 
 
@@ -205,7 +204,7 @@ def _control(sweep: Sweep, study: Study, stage: StageRuns) -> str:
     return f"none, one α ({words[0]}) for all: policies of different q differ in entropy"
 
 
-def seeds_needed(claims: Sequence[Claim], means: Sequence[Mean], family: int) -> str | None:
+def power_in_words(claims: Sequence[Claim], means: Sequence[Mean], family: int) -> str | None:
     """How many seeds would decide; None without a margin or a known spread.
 
     Conditions within the margin of a bound are left out: their seeds differ less than others.
@@ -240,14 +239,13 @@ def seeds_needed(claims: Sequence[Claim], means: Sequence[Mean], family: int) ->
         return None
     paired = all(contrast.paired for contrast in clear)
     spread = float(np.sqrt(np.mean([float(contrast.spread) ** 2 for contrast in clear])))
-    level = SIGNIFICANCE / family
-    for_difference = seeds_for_difference(margin, spread, paired=paired, level=level)
-    for_equivalence = seeds_for_equivalence(margin, spread, paired=paired, level=level)
+    needed = seeds_needed(margin, spread, paired=paired, level=SIGNIFICANCE / family)
+    to_detect, to_exclude = map(_seeds_text, needed)
     return (
         f"The standard deviation of {'paired' if paired else 'single-seed'} differences is "
         f"{number(spread)}: for 80% power, a difference of {margin:g} needs "
-        f"{_seeds_text(for_difference)}, and equivalence within it needs "
-        f"{_seeds_text(for_equivalence)}."
+        f"{to_detect}, and equivalence within it needs "
+        f"{to_exclude}."
     )
 
 

@@ -28,19 +28,31 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 import pyarrow as pa
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pyarrow import compute, csv, parquet
+from pydantic import BaseModel, ConfigDict, Field
 
-from music_rllib.config.problems import shown
-from music_rllib.errors import first_line
-from music_rllib.limits import MOST_JSON_BYTES, MOST_YAML_BYTES, read_json, read_regular
+from music_rllib.errors import reason_of
+from music_rllib.limits import (
+    MOST_COLUMNS,
+    MOST_JSON_BYTES,
+    MOST_ROWS_PER_BYTE,
+    MOST_TABLE_ROWS,
+    MOST_TABLE_TEXT,
+    MOST_UNPACKED_BYTES,
+    MOST_UNPACKED_PER_BYTE,
+    MOST_YAML_BYTES,
+    open_regular,
+    read_json,
+    read_regular,
+)
 from music_rllib.results.analysis_plan import PlanVersion, as_document, checked_plans
-from music_rllib.results.archive_tables import read_table, write_table
 from music_rllib.results.data import (
     Column,
     History,
     ReportError,
     RunRecord,
     Sweep,
+    by_metric,
     checked_searches,
     joined,
 )
@@ -64,6 +76,18 @@ _METRICS = {
     "time_ms": pa.int64(),
 }
 """Columns of the table of metrics."""
+
+_FREE_ROWS = 100_000
+"""Number of rows allowed in a file of any size."""
+_FIRST_BYTES = 1 << 20
+"""Number of bytes that contain the first line of a CSV file."""
+_BATCH_ROWS = 65_536
+"""Rows of a Parquet file that are read before the length of its texts is checked."""
+_ENCODINGS = {"PLAIN", "PLAIN_DICTIONARY", "RLE", "RLE_DICTIONARY", "BIT_PACKED"}
+"""Encodings that Arrow writes by default; others can store long texts in almost no bytes."""
+_MAY_BE_EMPTY = ("started", "ended", "trained_seconds")
+_MAY_BE_MISSING = ("trained_seconds",)
+"""Columns that old exports lack."""
 
 _PLACES = re.compile(r"^(?P<name> *(?:storage|tracking_uri): )(?P<place>.+)$", re.MULTILINE)
 _LOCAL = re.compile(r"(sqlite(?:\+\w+)?:///)/(?:.*/)?([^/]+/[^/]+)|(?:file://)?/(?:.*/)?([^/]+)/*")
@@ -130,18 +154,21 @@ def read_archive(folder: Path) -> Sweep:
     try:
         header = _Header.model_validate(_read_json(file))
         file = folder / f"runs.{header.format}"
-        runs = read_table(file, _RUNS)
-        records = _records(runs)
+        records = [_record(row) for row in read_table(file, _RUNS).to_pylist()]
         file = folder / f"metrics.{header.format}"
         metrics = read_table(file, _METRICS)
-        history = _history(metrics, runs.num_rows)
+        points = [metrics[name].to_numpy() for name in ("run", "env_steps", "value", "time_ms")]
+        run = points[0]
+        if len(run) and not 0 <= run.min() <= run.max() < len(records):
+            raise ValueError(f"a metric's run must be one of {len(records)}, got {run.max()}")
+        history = by_metric(metrics["metric"], Column(*points))
         file = folder / _SEARCHES
         found = checked_searches(_read_json(file)) if file.exists() else ()
         file = folder / _PLANS
         plans = checked_plans(_read_json(file)) if file.exists() else ()
     except (OSError, KeyError, TypeError, ValueError, OverflowError, pa.ArrowException) as error:
         raise ReportError(
-            f"{folder} must hold an exported sweep: {file.name}: {_reason(error)}"
+            f"{folder} must hold an exported sweep: {file.name}: {reason_of(error)}"
         ) from error
     own = {name: getattr(header, name) for name in _OWN_FIELDS}
     return Sweep(**own, runs=records, history=history, searches=found, plans=plans)
@@ -166,18 +193,6 @@ def _read_json(file: Path) -> Any:
     return read_json(read_regular(file, MOST_JSON_BYTES))
 
 
-def _reason(error: Exception) -> str:
-    """The first finding, in one line."""
-    if isinstance(error, ValidationError):
-        finding = error.errors(include_url=False)[0]
-        place = ".".join(str(part) for part in finding["loc"])
-        rule = finding["msg"].replace("Input should", "must")
-        return f"{place} {rule}, got {shown(finding['input'])}"
-    if isinstance(error, OSError) and error.strerror:
-        return error.strerror
-    return f"must have {error}" if isinstance(error, KeyError) else first_line(error)
-
-
 def _without_place(search: Mapping[str, Any]) -> dict[str, Any]:
     storage = search.get("storage")
     return {**search, "storage": None if storage is None else _without_folders(storage)}
@@ -188,21 +203,20 @@ def _write_json(document: Any, file: Path) -> None:
 
 
 def _runs_table(runs: Sequence[RunRecord]) -> pa.Table:
-    table: dict[str, Any] = {"run": pa.array(range(len(runs)), pa.int64())}
-    for name in _RUN_FIELDS:
-        table[name] = pa.array([getattr(run, name) for run in runs], _RUNS[name])
-    table |= _wide("tag.", [run.tags for run in runs])
-    table |= _wide("param.", [run.params for run in runs])
-    return pa.table(table)
-
-
-def _wide(prefix: str, rows: Sequence[Mapping[str, str]]) -> dict[str, Any]:
-    keys = sorted({key for row in rows for key in row})
-    return {prefix + key: pa.array([row.get(key) for row in rows], pa.string()) for key in keys}
+    rows = [
+        {"run": number}
+        | {name: getattr(run, name) for name in _RUN_FIELDS}
+        | {f"tag.{name}": value for name, value in run.tags.items()}
+        | {f"param.{name}": value for name, value in run.params.items()}
+        for number, run in enumerate(runs)
+    ]
+    others = sorted({name for row in rows for name in row} - _RUNS.keys())
+    schema = pa.schema([*_RUNS.items(), *((name, pa.string()) for name in others)])
+    return pa.Table.from_pylist(rows, schema)
 
 
 def _metrics_table(sweep: Sweep) -> pa.Table:
-    every = joined(list(sweep.history.values()))
+    every = joined(sweep.history.values())
     metric = [pa.repeat(name, len(column.run)) for name, column in sweep.history.items()]
     return pa.table(
         {
@@ -215,38 +229,138 @@ def _metrics_table(sweep: Sweep) -> pa.Table:
     )
 
 
-def _records(table: pa.Table) -> list[RunRecord]:
-    return [
-        RunRecord(
-            **{name: row[name] for name in _RUN_FIELDS if name in row},
-            params=_narrow("param.", row),
-            tags=_narrow("tag.", row),
-        )
-        for row in table.to_pylist()
-    ]
+def _record(row: Mapping[str, Any]) -> RunRecord:
+    def having(prefix: str) -> dict[str, str]:
+        found = (name for name in row if name.startswith(prefix) and row[name] is not None)
+        return {name.removeprefix(prefix): row[name] for name in found}
+
+    own = {name: row[name] for name in _RUN_FIELDS if name in row}
+    return RunRecord(**own, params=having("param."), tags=having("tag."))
 
 
-def _narrow(prefix: str, row: Mapping[str, Any]) -> dict[str, str]:
-    return {
-        name.removeprefix(prefix): value
-        for name, value in row.items()
-        if name.startswith(prefix) and value is not None
+# Tables, which may come from strangers ------------------------------------------------------------
+
+
+def write_table(table: pa.Table, file: Path) -> None:
+    """Write a table in the format of the file's ending."""
+    if file.suffix == ".csv":
+        csv.write_csv(table, file)
+    else:
+        with parquet.ParquetWriter(file, table.schema, compression="zstd") as writer:
+            if table.num_rows:  # an empty row group would point to pages at the start of the file
+                writer.write_table(table)
+
+
+def read_table(file: Path, kinds: Mapping[str, pa.DataType]) -> pa.Table:
+    """Read a table and check it against a schema, as far as possible before it takes memory.
+
+    Args:
+        file: A `.csv` or Parquet file.
+        kinds: Types of the required columns, by name; other columns are text.
+
+    Raises:
+        OSError: The file can't be read.
+        ValueError: A column is missing, or the table is too large for its file.
+        pyarrow.ArrowException: The file is damaged.
+    """
+    with open_regular(file) as source:
+        head, size = source.read(_FIRST_BYTES), os.fstat(source.fileno()).st_size
+    # Arrow's own threads can't wait for Python's at the end of a process.
+    with pa.OSFile(str(file)) as native:
+        if file.suffix == ".csv":
+            table = _from_csv(native, head, kinds)
+        else:
+            table = _from_parquet(native, size)
+    missing = kinds.keys() - {*table.column_names, *_MAY_BE_MISSING}
+    if missing:
+        raise ValueError(f"must have the column {min(missing)}, got {table.column_names[:9]}")
+    if len(set(table.column_names)) < table.num_columns:
+        raise ValueError("must have columns with different names")
+    names = table.column_names
+    schema = pa.schema([(name, kinds.get(name, pa.string())) for name in names])
+    table = table.cast(schema)
+    for name in kinds:
+        if name not in _MAY_BE_EMPTY and table[name].null_count:
+            raise ValueError(f"{name} must have a value in each row")
+    return table
+
+
+def _check_size(rows: int, columns: int, size: int) -> None:
+    most = min(MOST_TABLE_ROWS, _FREE_ROWS + MOST_ROWS_PER_BYTE * size)
+    if rows > most:
+        raise ValueError(f"must have at most {most} rows in {size} bytes, got {rows}")
+    if columns > MOST_COLUMNS:
+        raise ValueError(f"must have at most {MOST_COLUMNS} columns, got {columns}")
+
+
+def _characters(batch: pa.RecordBatch) -> int:
+    """Number of characters of all texts; a text in a dictionary counts at each use."""
+    texts = (column for column in batch.columns if isinstance(column, pa.DictionaryArray))
+    lengths = (compute.binary_length(text.dictionary).take(text.indices) for text in texts)
+    return sum(compute.sum(length).as_py() or 0 for length in lengths)
+
+
+def _check_metadata(metadata: parquet.FileMetaData, size: int) -> None:
+    """Check the sizes in a Parquet file's footer."""
+    _check_size(metadata.num_rows, metadata.num_columns, size)
+    groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
+    if (rows := sum(group.num_rows for group in groups)) != metadata.num_rows:
+        raise ValueError(f"must have {metadata.num_rows} rows, as its footer states, got {rows}")
+    columns = [group.column(i) for group in groups for i in range(group.num_columns)]
+    for column in columns:
+        if others := {*column.encodings} - _ENCODINGS:
+            raise ValueError(
+                f"{column.path_in_schema} must be encoded as {', '.join(sorted(_ENCODINGS))}, "
+                f"got {', '.join(sorted(others))}"
+            )
+    unpacked = [column.total_uncompressed_size for column in columns]
+    most = MOST_UNPACKED_BYTES + MOST_UNPACKED_PER_BYTE * size
+    if sum(unpacked) > most or min(unpacked, default=0) < 0:
+        raise ValueError(f"must have at most {most} bytes when unpacked, got {sum(unpacked)}")
+
+
+def _from_parquet(source: pa.NativeFile, size: int) -> pa.Table:
+    limits: dict[str, Any] = {
+        "thrift_string_size_limit": 16 << 20,
+        "thrift_container_size_limit": 1_000_000,
     }
+    footer = parquet.ParquetFile(source, **limits)
+    _check_metadata(footer.metadata, size)
+    schema = footer.schema_arrow
+    for field in schema:
+        plain = pa.types.is_string(field.type) or pa.types.is_large_string(field.type)
+        if not (plain or pa.types.is_primitive(field.type) or pa.types.is_null(field.type)):
+            raise ValueError(f"{field.name} must be text or numbers, got {field.type}")
+    # Dictionaries keep a text that is repeated in every row only once.
+    texts = [field.name for field in schema if pa.types.is_string(field.type)]
+    source.seek(0)
+    batches, total = [], 0
+    reader = parquet.ParquetFile(source, read_dictionary=texts, **limits)
+    for batch in reader.iter_batches(_BATCH_ROWS):
+        batches.append(batch)
+        total += _characters(batch)
+        if total > MOST_TABLE_TEXT:  # checked after each batch: the footer may be wrong
+            raise ValueError(f"must have at most {MOST_TABLE_TEXT} characters of text")
+    return pa.Table.from_batches(batches, reader.schema_arrow if not batches else None)
 
 
-def _history(table: pa.Table, runs: int) -> dict[str, Column]:
-    metrics = table["metric"].combine_chunks().dictionary_encode()
-    codes = metrics.indices.to_numpy(zero_copy_only=False)
-    every = Column(*(table[name].to_numpy() for name in ("run", "env_steps", "value", "time_ms")))
-    run = every.run
-    if len(run) and not 0 <= run.min() <= run.max() < runs:
-        raise ValueError(f"a metric's run must be one of {runs}, got {run.min()} to {run.max()}")
-    order = np.lexsort((every.step, run, codes))
-    ends = np.searchsorted(codes[order], np.arange(len(metrics.dictionary) + 1))
-    return {
-        name: every.select(order[ends[code] : ends[code + 1]])
-        for code, name in enumerate(metrics.dictionary.to_pylist())
-    }
+def _from_csv(source: pa.NativeFile, head: bytes, kinds: Mapping[str, pa.DataType]) -> pa.Table:
+    first, _, _ = head.partition(b"\n")
+    _check_size(0, first.count(b",") + 1, 0)
+    names = csv.read_csv(pa.BufferReader(first + b"\n")).column_names
+    convert = csv.ConvertOptions(
+        column_types={name: kinds.get(name, pa.string()) for name in names},
+        # An empty field is null, an empty text in quotes is a text, and nan is a number.
+        null_values=[""],
+        strings_can_be_null=True,
+        quoted_strings_can_be_null=False,
+    )
+    # The text of a failure has line breaks.
+    return csv.read_csv(
+        source,
+        convert_options=convert,
+        parse_options=csv.ParseOptions(newlines_in_values=True),
+    )
 
 
 # Merging ------------------------------------------------------------------------------------------
@@ -300,5 +414,5 @@ def history_of(places: Sequence[Place]) -> History:
         for metric in sweep.history:
             part = sweep.column(position, metric)
             if len(part.run):
-                parts[metric].append(replace(part, run=np.full_like(part.run, number)))
+                parts[metric].append(part._replace(run=np.full_like(part.run, number)))
     return {metric: joined(parts[metric]) for metric in sorted(parts)}

@@ -69,7 +69,6 @@ class Contrast:
     """Standard deviation of a difference between single seeds; NaN if unknown."""
     paired: bool
     seeds: tuple[int, int]
-    """Number of seeds of `x` and of `y`."""
     collapsed: Array
     """Number of seeds far from all others, on the side that has more of them."""
 
@@ -237,7 +236,6 @@ class Claim:
     """Adjusted p-value of no equivalence; None also without a margin."""
     verdict: Verdict = Verdict.NONE
     why: str = ""
-    """Reason for having no verdict."""
     planned: bool = False
     """Whether it was planned before the first of its runs had finished."""
     hypothesis: Hypothesis | None = None
@@ -299,8 +297,8 @@ def claims_of(
                 [scores_of(sweep, pair[side], task, m) for pair in pairs for task, m in own.items()]
                 for side in (0, 1)
             ]
+            both = [one for side in sides for one in side]
             tested = _contrast(*sides, margin=own_margin)
-            asked = [max(one.runs, seeds) for side in sides for one in side]
             if tested is not None:
                 yield Claim(
                     first=first,
@@ -310,12 +308,8 @@ def claims_of(
                     margin=own_margin,
                     contrast=tested,
                     pairs=pairs,
-                    asked=sum(asked),
-                    unfinished=sum(
-                        max(one.unfinished, seeds - len(one.by_seed))
-                        for side in sides
-                        for one in side
-                    ),
+                    asked=sum(max(one.runs, seeds) for one in both),
+                    unfinished=sum(max(one.unfinished, seeds - len(one.by_seed)) for one in both),
                 )
 
 

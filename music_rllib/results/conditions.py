@@ -7,15 +7,12 @@ sweep is extended.
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from music_rllib import names
 from music_rllib.results.data import RunRecord, Sweep
-from music_rllib.results.statistics import Array
 
 Values = tuple[tuple[str, str], ...]
 """(setting, value) pairs."""
@@ -51,11 +48,9 @@ class Condition:
     others: Values
     """Other settings that tell the condition apart in its stage."""
     runs: tuple[int, ...]
-    """Positions in `Sweep.runs`."""
 
     @property
     def is_fresh(self) -> bool:
-        """Whether its runs are those of a search on fresh seeds."""
         return (SEEDS, FRESH) in self.others
 
     @property
@@ -98,7 +93,6 @@ class StageRuns:
 
     @property
     def has_task_reward(self) -> bool:
-        """Whether its runs are trained for success."""
         return self.variant not in {"music-u", "intrinsic-u"}
 
 
@@ -153,29 +147,6 @@ def find_stages(sweep: Sweep) -> list[StageRuns]:
         _stage(sweep.runs, name, runs, {run: varied_values(run) for run in runs})
         for name, runs in stages.items()
     ]
-
-
-def final_scores(sweep: Sweep, condition: Condition, metrics: Mapping[str, str]) -> Array:
-    """Last values of finished runs, `[seeds, T]`; NaN if missing.
-
-    Args:
-        sweep: The runs.
-        condition: The condition.
-        metrics: Task to metric, for T tasks.
-    """
-    tasks = list(metrics)
-    rows: dict[tuple[str, int], Array] = {}
-    seen: Counter[tuple[str, str]] = Counter()
-    for run in condition.runs:
-        record = sweep.runs[run]
-        # A condition of several q has a seed several times, in the same order on every task.
-        key = (record.seed, seen[record.seed, record.task])
-        seen[record.seed, record.task] += 1
-        row = rows.setdefault(key, np.full(len(tasks), np.nan))
-        score = sweep.final(run, metrics[record.task])
-        if record.is_finished and score is not None:
-            row[tasks.index(record.task)] = score
-    return np.array(list(rows.values())).reshape(len(rows), len(tasks))
 
 
 def _stage(

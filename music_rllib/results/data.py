@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 from pydantic import BaseModel, JsonValue, TypeAdapter
 
@@ -27,14 +27,12 @@ class ReportError(BadInputError):
     """A sweep or an export can't be read or written; names the place and what to do."""
 
 
-@dataclass(frozen=True)
-class Column:
+class Column(NamedTuple):
     """N values of one metric, sorted by run and step, at most one for each run and step."""
 
     run: Ints
     """`[N]` positions in `Sweep.runs`."""
     step: Ints
-    """`[N]` environment steps."""
     value: Array
     """`[N]`; may be NaN or infinite."""
     time: Ints
@@ -45,60 +43,60 @@ class Column:
         return Column(self.run[which], self.step[which], self.value[which], self.time[which])
 
     def of_run(self, run: int) -> Column:
-        """The values of one run."""
         begin, end = np.searchsorted(self.run, [run, run + 1])
         return self.select(slice(begin, end))
 
 
 _NONE = np.empty(0, np.int64)
-_NO_VALUES = Column(run=_NONE, step=_NONE, value=np.empty(0), time=_NONE)
+_NO_VALUES = Column(_NONE, _NONE, np.empty(0), _NONE)
 
 History = Mapping[str, Column]
 """Metric name to column."""
 
 
 class Points(NamedTuple):
-    """Everything that one run logged, `[points]` each, sorted by metric and step."""
+    """Everything that one run logged, `[points]` each."""
 
-    metrics: Sequence[str]
-    steps: Sequence[int] | Ints
-    times: Sequence[int] | Ints
-    values: Sequence[float] | Array
+    metrics: Sequence[str] = ()
+    steps: Sequence[int] | Ints = ()
+    times: Sequence[int] | Ints = ()
+    values: Sequence[float] | Array = ()
 
 
 def columns(runs: Iterable[Points]) -> dict[str, Column]:
-    """Build columns from one `Points` per run, in the order of the runs.
+    """Columns from one `Points` per run, in the order of the runs."""
+    runs = list(runs)
+    parts = (
+        Column(
+            np.full(len(points.metrics), position),
+            np.asarray(points.steps, np.int64),
+            np.asarray(points.values, np.float64),
+            np.asarray(points.times, np.int64),
+        )
+        for position, points in enumerate(runs)
+    )
+    metrics = [pa.array(points.metrics, pa.string()) for points in runs]
+    return by_metric(pa.chunked_array(metrics, pa.string()), joined(parts))
+
+
+def by_metric(metrics: pa.ChunkedArray, values: Column) -> dict[str, Column]:
+    """Columns from a table: the metric of each row, and its other values.
 
     If a run has several values of a metric at one step, the one logged last counts.
     """
-    parts: defaultdict[str, list[Column]] = defaultdict(list)
-    for position, points in enumerate(runs):
-        of_run = Column(
-            run=np.full(len(points.metrics), position, dtype=np.int64),
-            step=np.asarray(points.steps, dtype=np.int64),
-            value=np.asarray(points.values, dtype=np.float64),
-            time=np.asarray(points.times, dtype=np.int64),
-        )
-        begin = 0
-        for metric, count in Counter(points.metrics).items():
-            part = of_run.select(slice(begin, begin + count))
-            begin += count
-            is_last = np.append(np.diff(part.step) != 0, True)
-            if not is_last.all():
-                part = part.select(np.lexsort((part.time, part.step)))
-            parts[metric].append(part.select(is_last))
-    return {metric: joined(of_metric) for metric, of_metric in parts.items()}
+    coded = metrics.combine_chunks().dictionary_encode()
+    codes = coded.indices.to_numpy(zero_copy_only=False)
+    order = np.lexsort((values.time, values.step, values.run, codes))
+    keys = np.stack((codes, values.run, values.step))[:, order]
+    order = order[np.append((np.diff(keys) != 0).any(axis=0), True)[: len(order)]]
+    ends = np.searchsorted(codes[order], np.arange(len(coded.dictionary) + 1))
+    found = sorted((name, code) for code, name in enumerate(coded.dictionary.to_pylist()))
+    return {name: values.select(order[ends[code] : ends[code + 1]]) for name, code in found}
 
 
-def joined(parts: Sequence[Column]) -> Column:
+def joined(parts: Iterable[Column]) -> Column:
     """Concatenate columns."""
-    parts = parts or [_NO_VALUES]
-    return Column(
-        run=np.concatenate([part.run for part in parts]),
-        step=np.concatenate([part.step for part in parts]),
-        value=np.concatenate([part.value for part in parts]),
-        time=np.concatenate([part.time for part in parts]),
-    )
+    return Column(*map(np.concatenate, zip(_NO_VALUES, *parts, strict=True)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,7 +109,6 @@ class RunRecord:
     status: str
     """RUNNING, FINISHED, FAILED, KILLED or SCHEDULED."""
     started: int | None = None
-    """Start in ms since the epoch."""
     ended: int | None = None
     """Last report in ms since the epoch."""
     trained_seconds: float | None = None
@@ -194,7 +191,6 @@ class Sweep:
     searches: Sequence[Mapping[str, Any]] = field(default=(), repr=False)
     """Content of `search.json`: trials, importance and ranking of each search."""
     plans: Sequence[PlanVersion] = field(default=(), repr=False)
-    """Versions of the analysis plan, in the order of their times."""
     earlier: str | None = None
     """A sentence about the runs of earlier plans, which are not part of the sweep."""
 
@@ -236,7 +232,7 @@ class Sweep:
         kept = np.array([wanted(run) for run in self.runs], dtype=bool)
         position = np.cumsum(kept) - 1
         history = {
-            metric: replace(chosen, run=position[chosen.run])
+            metric: chosen._replace(run=position[chosen.run])
             for metric, column in self.history.items()
             if len((chosen := column.select(kept[column.run])).run)
         }
@@ -244,7 +240,6 @@ class Sweep:
         return replace(self, runs=runs, history=history)
 
     def on(self, task: str) -> list[int]:
-        """Positions of the runs on a task."""
         return [position for position, run in enumerate(self.runs) if run.task == task]
 
     def primary_metric(self, task: str) -> str:
@@ -290,7 +285,7 @@ def with_pretraining(sweep: Sweep) -> Sweep:
         for part in chain:
             own = column.of_run(part)
             own = own.select(own.step <= budgets[part])
-            parts.append(replace(own, run=0 * own.run + chain[-1], step=own.step + before))
+            parts.append(own._replace(run=0 * own.run + chain[-1], step=own.step + before))
             before += budgets[part]
         curve = joined(parts)
         return curve.select(np.diff(curve.step, append=np.iinfo(np.int64).max) > 0)
@@ -410,7 +405,7 @@ class LastValues:
 
 def _last_points(result: RunResult | None) -> Points:
     if result is None:
-        return Points((), (), (), ())
-    values = [result.metrics[name] for name in sorted(result.metrics)]
-    steps = [result.env_steps] * len(values)
-    return Points(sorted(result.metrics), steps, [0] * len(values), values)
+        return Points()
+    count = len(result.metrics)
+    steps = [result.env_steps] * count
+    return Points(list(result.metrics), steps, [0] * count, list(result.metrics.values()))

@@ -41,14 +41,14 @@ _CURVE_COLUMNS = {
     "value": "float64",
     "time": "datetime64[ms, UTC]",
 }
-_ENDS = {"": "value", "_lower": "lower", "_upper": "upper"}
-_ENTROPIES = [f"{name}_entropy{end}" for name in ("shannon", "tsallis") for end in _ENDS]
+_ENTROPIES = ("shannon_entropy", "tsallis_entropy")
 _CONDITION_COLUMNS = {
     **dict.fromkeys(("stage", "variant", "task", "condition"), "str"),
     "q": "float64",
     "metric": "str",
     **dict.fromkeys(("seeds", "runs"), "int64"),
-    **dict.fromkeys(("mean", "lower", "upper", *_ENTROPIES), "float64"),
+    **dict.fromkeys(("mean", "lower", "upper"), "float64"),
+    **{f"{name}{end}": "float64" for name in _ENTROPIES for end in ("", "_lower", "_upper")},
 }
 
 
@@ -124,25 +124,23 @@ def _runs(sweep: Sweep, keys: list[str]) -> pd.DataFrame:
             }
         )
     frame = _frame(rows, _RUN_COLUMNS)
+    settings = pd.DataFrame([dict(run.params) for run in sweep.runs], index=frame.index)
     # These params already have a column.
-    params = {name for run in sweep.runs for name in run.params} - {"env_steps", "seed", "variant"}
-    settings = {
-        name: _typed([run.params.get(name) for run in sweep.runs]) for name in sorted(params)
-    }
-    frame = pd.concat([frame, pd.DataFrame(settings, index=frame.index)], axis=1)
+    settings = settings.drop(columns=["env_steps", "seed", "variant"], errors="ignore")
+    frame = pd.concat([frame, settings.sort_index(axis=1).apply(_typed)], axis=1)
     return frame.set_index(pd.Index(keys, name="key", dtype="str"))
 
 
-def _typed(texts: list[str | None]) -> Any:
+def _typed(texts: pd.Series[Any]) -> Any:
     """A column of numbers if all texts are numbers, else of texts."""
     try:
-        return pd.to_numeric(pd.Series(texts))
+        return pd.to_numeric(texts)
     except ValueError:
-        return pd.Series(texts, dtype="str")
+        return texts.astype("str")
 
 
 def _curves(sweep: Sweep, keys: list[str]) -> pd.DataFrame:
-    every = joined(list(sweep.history.values()))
+    every = joined(sweep.history.values())
     counts = [len(column.run) for column in sweep.history.values()]
     rows = {
         "key": pd.Series(keys, dtype="str").take(every.run).array,
@@ -156,16 +154,12 @@ def _curves(sweep: Sweep, keys: list[str]) -> pd.DataFrame:
 
 def _conditions(sweep: Sweep) -> Iterator[dict[str, Any]]:
     for analysis in analyse(sweep):
-        stage = analysis.stage
         for scope in analysis.scopes:
             for final in scope.finals:
                 condition = final.condition
-                entropies = zip(
-                    ("shannon", "tsallis"), analysis.entropies[scope.name, condition], strict=True
-                )
-                yield {
-                    "stage": stage.name,
-                    "variant": stage.variant,
+                row = {
+                    "stage": analysis.stage.name,
+                    "variant": analysis.stage.variant,
                     "task": scope.name,
                     "condition": condition.label,
                     "q": sweep.final(condition.runs[0], names.SETTING_ENTROPIC_INDEX),
@@ -175,13 +169,14 @@ def _conditions(sweep: Sweep) -> Iterator[dict[str, Any]]:
                     "mean": final.value,
                     "lower": float(final.estimate.lower),
                     "upper": float(final.estimate.upper),
-                    **{
-                        f"{name}_entropy{end}": float(getattr(entropy, attribute))
-                        for name, entropy in entropies
-                        if entropy is not None
-                        for end, attribute in _ENDS.items()
-                    },
                 }
+                entropies = analysis.entropies[scope.name, condition]
+                for name, entropy in zip(_ENTROPIES, entropies, strict=True):
+                    if entropy is not None:
+                        row[name] = float(entropy.value)
+                        row[f"{name}_lower"] = float(entropy.lower)
+                        row[f"{name}_upper"] = float(entropy.upper)
+                yield row
 
 
 def _frame(rows: Any, columns: dict[str, str]) -> pd.DataFrame:

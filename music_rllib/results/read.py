@@ -6,7 +6,7 @@ earlier versions of the plan are not read; a sentence names them.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,7 +18,7 @@ from pydantic_core import from_json
 from music_rllib import names
 from music_rllib.config.schema import SweepConfig
 from music_rllib.envs.fingerprint import digest_of
-from music_rllib.errors import first_line
+from music_rllib.errors import reason_of
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.open_sweep import OpenSweep, open_started
 from music_rllib.experiment.plan import Node
@@ -92,21 +92,19 @@ def read_stored(
     """Read a sweep from its storage; see :func:`read_sweep`."""
     opened = open_started(location, lenient=lenient)
     state = location.read(sweep_files.STATE) or _NOT_STARTED
-    runs = _read_runs(opened, metrics, lenient=lenient)
-    pairs = list(zip(opened.plan.nodes, runs, strict=True))
-    causes = _causes(opened, state)
-    damage = {node.label: run.damage for node, run in pairs if run.damage is not None}
-    provenance = [run.provenance for run in runs if run.provenance]
+    found = list(opened.store.map(_reader(opened, state, metrics, lenient), opened.plan.nodes))
+    runs = [one.record for one in found]
+    damage = {one.record.name: one.damage for one in found if one.damage is not None}
     configuration = location.read(sweep_files.CONFIG)
     sweep = Sweep(
         name=location.name,
         status=_status(state),
         started=min((run.started for run in runs if run.started is not None), default=None),
         source=redact(opened.storage),
-        tags=provenance[-1] if provenance else {},
+        tags=next((one.provenance for one in reversed(found) if one.provenance), {}),
         config=yaml.safe_dump(configuration, sort_keys=False, allow_unicode=True),
-        runs=[_record(node, run, opened.plan.algorithm, state, causes) for node, run in pairs],
-        history=columns(run.points for run in runs),
+        runs=runs,
+        history=columns(one.points for one in found),
         searches=searches_of(location, opened.config),
         plans=plans_in(location.storage, location.name),
         earlier=earlier_text(location),
@@ -139,7 +137,7 @@ def searches_of(location: SweepLocation, config: SweepConfig) -> list[dict[str, 
     except (ValueError, TypeError, KeyError) as error:
         raise StorageError(
             f"{location.place}/{sweep_files.SEARCH} must hold the results of searches as "
-            f"the driver writes them: {first_line(error)}"
+            f"the driver writes them: {reason_of(error)}"
         ) from error
 
 
@@ -159,46 +157,55 @@ def _status(state: Mapping[str, Any]) -> str:
 
 
 class _Run(NamedTuple):
-    """The stored part of a run."""
+    """A run of the plan with everything that the storage has of it."""
 
-    points: Points = Points((), (), (), ())
-    begun: bool = False
-    finished: bool = False
-    started: int | None = None
-    ended: int | None = None
-    seconds: float | None = None
+    record: RunRecord
+    points: Points = Points()
     provenance: Mapping[str, str] = {}
     damage: DamagedError | None = None
 
 
-def _read_runs(opened: OpenSweep, metrics: Collection[str] | None, *, lenient: bool) -> list[_Run]:
-    """The runs of the plan, in its order; unfinished ones up to their last checkpoint."""
-    store, finished, begun = opened.store, opened.finished, opened.store.begun()
-    damaged = store.damage(opened.damaged)
+def _reader(
+    opened: OpenSweep, state: Mapping[str, Any], metrics: Collection[str] | None, lenient: bool
+) -> Callable[[Node], _Run]:
+    """The function that reads a run; an unfinished one up to its last checkpoint."""
+    store, begun = opened.store, opened.store.begun()
+    damaged, causes = store.damage(opened.damaged), _causes(opened, state)
+    is_alive, pruned = sweep_files.is_alive(state), state.get("pruned", ())
 
     def read(node: Node) -> _Run:
+        run = planned_run(node, opened.plan.algorithm)
         try:
             if node.key in damaged:
                 raise damaged[node.key]
-            if node.key in finished:
+            if node.key in opened.finished:
                 lines, provenance, environment = store.lines(node.key)
                 if environment is not None:
                     provenance[names.TAG_ENVIRONMENT] = digest_of(environment)
-                run = _run(lines, node, metrics)
-                return run._replace(finished=True, provenance=provenance)
+                run = replace(run, status="FINISHED", tags={**provenance, **run.tags})
+                return _Run(*_with_history(run, node, lines, metrics), provenance)
         except DamagedError as error:
             if not lenient:
                 raise
-            return _Run(begun=True, damage=error)
+            # Not FAILED, which has the worst score: the run has a result that can't be read.
+            run = replace(run, status="KILLED", tags={**run.tags, names.TAG_FAILURE: str(error)})
+            return _Run(run, damage=error)
+        if (cause := causes.get(node.key)) is not None:
+            run = replace(run, status="FAILED", tags={**run.tags, names.TAG_FAILURE: cause})
+        elif node.key in begun:
+            is_running = is_alive and node.key not in pruned
+            run = replace(run, status="RUNNING" if is_running else "KILLED")
         if node.key not in begun:
-            return _Run()
-        return _run(store.work_folder(node.key).lines(), node, metrics)
+            return _Run(run)
+        return _Run(*_with_history(run, node, store.work_folder(node.key).lines(), metrics))
 
-    return list(store.map(read, opened.plan.nodes))
+    return read
 
 
-def _run(lines: bytes, node: Node, metrics: Collection[str] | None) -> _Run:
-    """Parse the `history.jsonl` of a run.
+def _with_history(
+    run: RunRecord, node: Node, lines: bytes, metrics: Collection[str] | None
+) -> tuple[RunRecord, Points]:
+    """Parse the `history.jsonl` of a run; its settings count as values at step 0.
 
     Raises:
         DamagedError: The lines are not reports.
@@ -206,35 +213,30 @@ def _run(lines: bytes, node: Node, metrics: Collection[str] | None) -> _Run:
     try:
         # Parsing line by line, or with a model of the fields, would be several times slower.
         reports = from_json(b"[%s]" % b",".join(lines.splitlines()))
-        steps = [report["env_steps"] for report in reports]
+        if not reports:
+            return run, Points()
         times = [report["timestamp_ms"] for report in reports]
-        measured = [
-            {**report["metrics"], names.SYSTEM_SECONDS: report["seconds"]} for report in reports
+        began = round(times[0] - 1000 * reports[0]["seconds"])
+        rows = [(name, 0, began, value) for name, value in run_info(node).settings.items()]
+        rows += [
+            (name, report["env_steps"], report["timestamp_ms"], value)
+            for report in reports
+            for name, value in (
+                *report["metrics"].items(),
+                (names.SYSTEM_SECONDS, report["seconds"]),
+            )
         ]
-        began = round(times[0] - 1000 * reports[0]["seconds"]) if reports else 0
-        settings = run_info(node).settings if reports else {}
-        names_of_all = {name for values in measured for name in values} | settings.keys()
-        order = sorted(names_of_all if metrics is None else names_of_all & set(metrics))
-        at = {
-            name: [-1]
-            if name in settings
-            else [number for number, values in enumerate(measured) if name in values]
-            for name in order
-        }
-        values = [(measured[i] if i >= 0 else settings)[name] for name in order for i in at[name]]
-        index = np.array([i for name in order for i in at[name]], dtype=np.int64)
+        wanted = [row for row in rows if metrics is None or row[0] in metrics]
         points = Points(
-            [name for name in order for _ in at[name]],
-            np.array([*steps, 0], dtype=np.int64)[index],
-            np.array([*times, began], dtype=np.int64)[index],
-            np.array(values, dtype=np.float64),
+            [name for name, *_ in wanted],
+            np.array([step for _, step, *_ in wanted], np.int64),
+            np.array([time for *_, time, _ in wanted], np.int64),
+            np.array([value for *_, value in wanted], np.float64),
         )
+        seconds = float(reports[-1]["seconds"])
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise DamagedError(f"the history of {node.label} must hold reports: {error}") from error
-    if not times:
-        return _Run(points, begun=True)
-    seconds = float(reports[-1]["seconds"])
-    return _Run(points, begun=True, started=began, ended=max(times), seconds=seconds)
+    return replace(run, started=began, ended=max(times), trained_seconds=seconds), points
 
 
 def _causes(opened: OpenSweep, state: Mapping[str, Any]) -> dict[str, str]:
@@ -246,35 +248,3 @@ def _causes(opened: OpenSweep, state: Mapping[str, Any]) -> dict[str, str]:
         if cause is not None and node.key not in opened.finished:
             causes[node.key] = cause
     return causes
-
-
-def _record(
-    node: Node,
-    run: _Run,
-    algorithm: str,
-    state: Mapping[str, Any],
-    causes: Mapping[str, str],
-) -> RunRecord:
-    planned = planned_run(node, algorithm)
-    tags = {**run.provenance, **planned.tags}
-    cause = causes.get(node.key)
-    if run.finished:
-        status = "FINISHED"
-    elif run.damage is not None:
-        # Not FAILED, which has the worst score: the run has a result that can't be read.
-        status, tags[names.TAG_FAILURE] = "KILLED", str(run.damage)
-    elif cause is not None:
-        status, tags[names.TAG_FAILURE] = "FAILED", cause
-    elif not run.begun:
-        status = "SCHEDULED"
-    else:
-        stopped = node.key in state.get("pruned", ()) or not sweep_files.is_alive(state)
-        status = "KILLED" if stopped else "RUNNING"
-    return replace(
-        planned,
-        status=status,
-        started=run.started,
-        ended=run.ended,
-        trained_seconds=run.seconds,
-        tags=tags,
-    )

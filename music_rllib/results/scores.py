@@ -33,7 +33,6 @@ class Measure:
     tasks with different horizons."""
     maximised: bool = True
     worst: float = np.nan
-    """Score of a failed run; NaN if unknown."""
 
     @property
     def is_rate(self) -> bool:
@@ -66,9 +65,7 @@ class Scores:
     noise: float
     """Mean variance of a rate's score from its evaluation episodes alone; 0 if unknown."""
     failed: int
-    """Number of failed runs."""
     runs: int
-    """Number of all runs."""
     unfinished: int
     """Number of runs that are neither finished nor failed."""
 

@@ -14,7 +14,7 @@ coverage of the intervals here; docs/reports.md lists it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,12 +49,10 @@ class Estimate:
 
     value: Array
     lower: Array
-    """NaN without an interval."""
     upper: Array
 
     @property
     def has_interval(self) -> bool:
-        """Whether every value has an interval."""
         return bool(np.all(np.isfinite(self.lower) & np.isfinite(self.upper)))
 
 
@@ -241,59 +239,38 @@ def censored_median(steps: Array, reached: NDArray[np.bool_]) -> Estimate:
 # Seeds needed -------------------------------------------------------------------------------------
 
 
-def seeds_for_difference(
-    difference: float, spread: float, *, paired: bool, level: float = SIGNIFICANCE
-) -> int | None:
-    """Number of seeds of each condition that detects `difference` with a power of 80%.
+def seeds_needed(
+    size: float, spread: float, *, paired: bool, level: float = SIGNIFICANCE
+) -> tuple[int | None, int | None]:
+    """Numbers of seeds of each condition that decide with a power of 80%.
 
     Args:
-        difference: Difference of the means, > 0.
+        size: Difference of the means, and margin of equivalence, > 0.
         spread: Standard deviation of a difference between single seeds, > 0.
         paired: Whether conditions share their seeds.
-        level: Level of the two-sided test; Holm's correction tests the first of k at 0.05 / k.
+        level: Level of the two-sided test, and of each one-sided test of equivalence; Holm's
+            correction tests the first of k at 0.05 / k.
 
     Returns:
-        The number; None if `MAX_SEEDS` are not enough.
+        Numbers to detect a difference of `size`, and to show equivalence within it if there is no
+        difference; None if `MAX_SEEDS` are not enough.
     """
-
-    def power(seeds: Array) -> Array:
-        freedom = (1 if paired else 2) * (seeds - 1)
-        shift = difference / spread * np.sqrt(seeds)
-        critical = stdtrit(freedom, 1 - level / 2)
-        return np.asarray(
-            1 - _t_below(critical, freedom, shift) + _t_below(-critical, freedom, shift)
-        )
-
-    return _fewest_seeds(power)
-
-
-def seeds_for_equivalence(
-    margin: float, spread: float, *, paired: bool, level: float = SIGNIFICANCE
-) -> int | None:
-    """Number of seeds that shows equivalence within `margin` with a power of 80% at no difference.
-
-    The arguments are those of :func:`seeds_for_difference`; `level` is the level of each one-sided
-    test.
-    """
-
-    def power(seeds: Array) -> Array:
-        freedom = (1 if paired else 2) * (seeds - 1)
-        critical = stdtrit(freedom, 1 - level)
-        # Both tests must reject. Either one misses with the same probability.
-        return 1 - 2 * _t_below(critical, freedom, margin / spread * np.sqrt(seeds))
-
-    return _fewest_seeds(power)
-
-
-def _t_below(end: Array, freedom: Array, shift: Array) -> Array:
-    """Cumulative distribution of the noncentral t; scipy's NaN far from the center means 0."""
-    return np.asarray(np.nan_to_num(scipy.stats.nct.cdf(end, freedom, shift), nan=0.0))
-
-
-def _fewest_seeds(power: Callable[[Array], Array]) -> int | None:
     seeds = np.arange(2.0, MAX_SEEDS + 1)  # one seed never decides
-    enough = power(seeds) >= POWER
-    return int(seeds[enough.argmax()]) if enough.any() else None
+    freedom = (1 if paired else 2) * (seeds - 1)
+
+    def below(end: Array) -> Array:
+        """Cumulative noncentral t; scipy's NaN far from the center means 0."""
+        below = scipy.stats.nct.cdf(end, freedom, size / spread * np.sqrt(seeds))
+        return np.asarray(np.nan_to_num(below, nan=0.0))
+
+    two_sided, one_sided = (stdtrit(freedom, 1 - tail) for tail in (level / 2, level))
+    detects = 1 - below(two_sided) + below(-two_sided) >= POWER
+    # Both one-sided tests must reject. Either one misses with the same probability.
+    excludes = 1 - 2 * below(one_sided) >= POWER
+    difference, equivalence = (
+        int(seeds[enough.argmax()]) if enough.any() else None for enough in (detects, excludes)
+    )
+    return difference, equivalence
 
 
 def _ratio(total: ArrayLike, count: ArrayLike) -> Array:

@@ -47,7 +47,6 @@ class Mean:
     estimate: Estimate
     scores: Scores = field(repr=False)
     runs: int
-    """Number of planned runs."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +58,6 @@ class Study:
     plan: PlanVersion | None
     """The last version recorded before the first of its runs had finished; None without one."""
     latest: PlanVersion | None
-    """The last version; None without a plan."""
     means: tuple[Mean, ...]
     planned: tuple[Claim, ...]
     """Claims of the hypotheses of `plan`."""

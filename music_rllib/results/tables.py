@@ -76,38 +76,28 @@ class Table:
     folded: bool = False
 
     @cached_property
-    def _shown(self) -> list[tuple[int, bool]]:
-        """Numbers of the columns on the page, and whether they are estimates.
-
-        The stage is left out if there is only one.
-        """
+    def _columns(self) -> list[tuple[str, Sequence[Cell]]]:
+        """Title and cells of each column on the page, without the stage if there is only one."""
+        shown: list[tuple[str, Sequence[Cell]]] = []
         columns = list(zip(*self.rows, strict=True)) or [()] * len(self.header)
-        return [
-            (i, any(isinstance(value, Estimate) for value in column))
-            for i, (name, column) in enumerate(zip(self.header, columns, strict=True))
-            if name != "Stage" or len(set(column)) > 1 or len(self.header) < 3
-        ]
+        for title, values in zip(self.header, columns, strict=True):
+            if title == "Stage" and len(set(values)) < 2 and len(self.header) > 2:
+                continue
+            if any(isinstance(value, Estimate) for value in values):
+                texts, intervals = zip(*map(_estimate, values), strict=True)
+                shown += [(title, texts), ("95% CI", intervals)]
+            else:
+                shown.append((title, [*map(_cell, values)]))
+        return shown
 
     @property
     def heads(self) -> list[tuple[str, str]]:
         """Each column's name on the page, and the kind of its first cell."""
-        titles: list[str] = []
-        for i, is_estimate in self._shown:
-            titles += [self.header[i], "95% CI"] if is_estimate else [self.header[i]]
-        kinds = [cell.kind for cell in self.cells[0]] if self.rows else [""] * len(titles)
-        return list(zip(titles, kinds, strict=True))
+        return [(title, cells[0].kind if cells else "") for title, cells in self._columns]
 
-    @cached_property
-    def cells(self) -> list[list[Cell]]:
-        """The rows as texts for the page."""
-        return [
-            [
-                cell
-                for i, is_estimate in self._shown
-                for cell in (_estimate(row[i]) if is_estimate else [_cell(row[i])])
-            ]
-            for row in self.rows
-        ]
+    @property
+    def cells(self) -> list[Sequence[Cell]]:
+        return list(zip(*(cells for _, cells in self._columns), strict=True))
 
     def to_csv(self) -> str:
         """The unrounded values; an estimate has the columns `x`, `x_lower` and `x_upper`."""
@@ -173,13 +163,13 @@ def _number(value: float) -> str:
     return "not reached" if math.isinf(value) else number(value)
 
 
-def _estimate(value: object) -> list[Cell]:
+def _estimate(value: object) -> tuple[Cell, Cell]:
     """An estimate's value and its 95% CI."""
     if not isinstance(value, Estimate):
-        return [Cell(DASH, "number"), Cell(DASH)]
+        return Cell(DASH, "number"), Cell(DASH)
     low, high = float(value.lower), float(value.upper)
     interval = "no interval" if math.isnan(low) else f"{_number(low)} to {_number(high)}"
-    return [Cell(_number(float(value.value)), "number"), Cell(interval)]
+    return Cell(_number(float(value.value)), "number"), Cell(interval)
 
 
 UNFOLDED_ROWS = 30

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from music_rllib.envs.tasks import Task
-from music_rllib.errors import BadInputError
+from music_rllib.errors import BadInputError, reason_of
 from music_rllib.limits import (
     MOST_JSON_BYTES,
     MOST_WEIGHTS_BYTES,
@@ -117,17 +117,12 @@ class HandoffInfo(_Strict):
     variant: str
     architecture: Architecture
     env_steps: int
-    """Environment steps of the source run."""
     seed: int
     node_key: str
-    """Key of the source run."""
     algorithm_version: str = ALGORITHM_VERSION
     spaces: Spaces
-    """Spaces of the environment."""
     observation_clip: float
-    """`tac.observation_clip`."""
     max_episode_steps: int | None
-    """`tac.max_episode_steps`."""
 
 
 class _Array(_Strict):
@@ -202,19 +197,11 @@ def open_handoff(folder: Path) -> tuple[Path, HandoffManifest]:
                 content = read_json(read_regular(path, MOST_JSON_BYTES))
                 return candidate, HandoffManifest.model_validate(content)
             except (ValueError, OSError) as error:
-                raise HandoffError(f"{path} must be a handoff manifest: {_reason(error)}") from None
+                raise HandoffError(
+                    f"{path} must be a handoff manifest: {reason_of(error)}"
+                ) from None
     found = "the folder exists" if folder.is_dir() else "the folder does not exist"
     raise HandoffError(f"{folder} must hold a handoff ({MANIFEST} and weights): {found}")
-
-
-def _reason(error: ValueError | OSError) -> str:
-    if isinstance(error, OSError):
-        return str(error.strerror)
-    if not isinstance(error, ValidationError):
-        return str(error)
-    finding = error.errors(include_url=False)[0]
-    place = ".".join(str(part) for part in finding["loc"])
-    return f"{place}: {finding['msg']}" if place else finding["msg"]
 
 
 def read_handoff(

@@ -81,7 +81,6 @@ class NodeStore(SealedFolders):
             raise DamagedError(f"{place} must hold a run's result: {error}") from error
 
     def history(self, key: str) -> list[Report]:
-        """All reports of a finished run."""
         try:
             return from_json_lines(self.read(key, HISTORY))
         except ValueError as error:
@@ -229,7 +228,6 @@ class NodeStore(SealedFolders):
                 )
 
     def begun(self) -> set[str]:
-        """Keys of the runs that have a work folder."""
         return set((self._root / "work").folders())
 
     def work_folder(self, key: str, keep: int = KEEP) -> WorkFolder:

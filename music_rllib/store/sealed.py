@@ -20,8 +20,9 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, BinaryIO, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue
 
+from music_rllib.errors import reason_of
 from music_rllib.limits import MOST_JSON_BYTES, open_regular, read_json
 from music_rllib.store.storage import (
     DamagedError,
@@ -85,7 +86,6 @@ class SealedFolders:
         return f"{self.folder.path}/{name}"
 
     def names(self) -> list[str]:
-        """Sorted names of the sealed folders."""
         folders = [name for name in self.folder.folders() if not name.startswith(".")]
         return sorted(self.folder.having(MANIFEST, folders))
 
@@ -94,7 +94,6 @@ class SealedFolders:
         return bool(self.folder.having(MANIFEST, [name]))
 
     def manifest(self, name: str, *, keep: bool = False) -> Manifest:
-        """The manifest of a sealed folder."""
         path = f"{self.path(name)}/{MANIFEST}"
         try:
             data = self._kept.get(name) or self._start_of(path)
@@ -104,10 +103,7 @@ class SealedFolders:
         except FileNotFoundError as error:
             raise DamagedError(f"{path} must exist, it does not") from error
         except ValueError as error:
-            reason: object = error
-            if isinstance(error, ValidationError):
-                reason = error.errors(include_url=False)[0]["msg"]
-            raise DamagedError(f"{path} must be a manifest: {reason}") from error
+            raise DamagedError(f"{path} must be a manifest: {reason_of(error)}") from error
         if manifest.name != name:
             raise DamagedError(f"{path} must be the manifest of {name}, got {manifest.name!r}")
         return manifest

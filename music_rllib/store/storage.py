@@ -111,7 +111,6 @@ class StorageFolder:
 
     @property
     def is_local(self) -> bool:
-        """Whether the folder is on a disk."""
         return isinstance(self.filesystem, pafs.LocalFileSystem)
 
     def __truediv__(self, name: str) -> StorageFolder:
@@ -162,7 +161,6 @@ class StorageFolder:
         return call() if self.is_local else patiently(call)
 
     def remove(self, name: str) -> None:
-        """Delete a file if it exists."""
         with contextlib.suppress(FileNotFoundError):
             self.request(lambda: self.filesystem.delete_file(f"{self.path}/{name}"))
 
@@ -172,11 +170,9 @@ class StorageFolder:
             self.request(lambda: self.filesystem.delete_dir(f"{self.path}/{name}".rstrip("/")))
 
     def folders(self) -> list[str]:
-        """Names of the folders in this folder."""
         return [info.base_name for info in self.entries() if not info.is_file]
 
     def files(self) -> list[str]:
-        """Names of the files in this folder."""
         return [info.base_name for info in self.entries() if info.is_file]
 
     def entries(self, *, recursive: bool = False) -> list[pafs.FileInfo]:
@@ -185,7 +181,6 @@ class StorageFolder:
         return self.request(lambda: self.filesystem.get_file_info(selector))
 
     def info(self, path: str) -> pafs.FileInfo:
-        """Type and size of a file or folder."""
         return self.request(lambda: self.filesystem.get_file_info(path))
 
     def having(self, file: str, folders: Iterable[str]) -> list[str]:

@@ -26,7 +26,6 @@ class SavedCheckpoint(NamedTuple):
 
     folder: Path
     parts: Mapping[str, Path]
-    """Folder of each part, by its name."""
     environment: Fingerprint | None = None
 
 
@@ -99,7 +98,6 @@ class WorkFolder:
             self._parts.remove(name)
 
     def names(self) -> list[str]:
-        """Names of the checkpoints, oldest first."""
         return self._checkpoints.names()
 
     @contextlib.contextmanager
@@ -162,7 +160,6 @@ class WorkFolder:
                 Path(self.folder.path).rmdir()
 
     def clear(self) -> None:
-        """Delete the folder with all checkpoints and parts."""
         for name in self.names():  # their manifests first, so that nobody uses a half-deleted one
             self._checkpoints.remove(name)
         self.folder.delete()

@@ -104,7 +104,6 @@ class KnownRun(NamedTuple):
 
     @property
     def is_complete(self) -> bool:
-        """Whether it is finished and all of its data has arrived."""
         return self.status == "FINISHED" and names.TAG_INCOMPLETE not in self.tags
 
 
@@ -121,12 +120,10 @@ class Experiment:
         self._sweep_id = sweep_id
         self._plan = plan
         self._earlier: list[KnownRun] = []
-        """Parent runs of other plans of the sweep."""
-        self._known: dict[str, KnownRun] | None = None
-        """Runs by node key ("" for the parent run); None until the server has listed them."""
+        self.known: dict[str, KnownRun] | None = None
+        """Runs by node key ("" for the parent run); None: the next search lists them."""
         with answers_named(store, f"accept the experiment {name!r}"):
             self.client = open_client(store)
-            """Sends the requests about one run."""
             self.id = self._find_or_create()
 
     # -- finding and creating runs -----------------------------------------------------------
@@ -139,11 +136,11 @@ class Experiment:
         Lists all runs of the sweep on the first call, and looks for an unknown one `again`. A run
         of another environment is deleted (it can be restored), because a new run replaces it.
         """
-        if self._known is None:
-            self._known = self._list()
-        elif again and node_key and node_key not in self._known:
-            self._known |= self._list(f" AND tags.`{names.TAG_NODE_KEY}` = '{node_key}'")
-        known = self._known.get(node_key)
+        if self.known is None:
+            self.known = self._list()
+        elif again and node_key and node_key not in self.known:
+            self.known |= self._list(f" AND tags.`{names.TAG_NODE_KEY}` = '{node_key}'")
+        known = self.known.get(node_key)
         found = known.tags.get(names.TAG_ENVIRONMENT) if known else None
         if environment and found not in (None, environment):
             self.delete(node_key)
@@ -152,14 +149,12 @@ class Experiment:
 
     def delete(self, node_key: str) -> None:
         """Delete a node's run, if there is one, so that it can still be restored."""
-        known = self.find(node_key)
-        if known is not None and self._known is not None:
-            self.client.delete_run(known.run_id)
-            del self._known[node_key]
+        if self.find(node_key) is not None and self.known is not None:
+            self.client.delete_run(self.known.pop(node_key).run_id)
 
     def known_id(self, node_key: str) -> str | None:
         """Run id of a node whose run was found or created before; sends no request."""
-        run = (self._known or {}).get(node_key)
+        run = (self.known or {}).get(node_key)
         return None if run is None else run.run_id
 
     def create(self, node_key: str, name: str, time: int, tags: Mapping[str, str]) -> KnownRun:
@@ -175,16 +170,12 @@ class Experiment:
         try:
             run = self.client.create_run(self.id, start_time=time, tags=all_tags, run_name=name)
         except Exception:
-            self._known = None  # listed again, as the response may be lost
+            self.known = None  # listed again, as the response may be lost
             raise
         new = KnownRun(str(run.info.run_id), run.info.status, all_tags)
-        if self._known is not None:
-            self._known[node_key] = new
+        if self.known is not None:
+            self.known[node_key] = new
         return new
-
-    def look_again(self) -> None:
-        """List the runs again when one is looked for."""
-        self._known = None
 
     def _list(self, also: str = "") -> dict[str, KnownRun]:
         """The sweep's runs with a condition, by node key; the older of two with the same key."""
@@ -211,8 +202,6 @@ class Experiment:
             if not token:
                 return known
 
-    # -- the sweep ---------------------------------------------------------------------------
-
     def keep_current(self, node_keys: Collection[str]) -> None:
         """Mark the runs of these nodes, and the parent run, as current, and no other runs.
 
@@ -222,34 +211,25 @@ class Experiment:
         current = {names.TAG_CURRENT: names.CURRENT}
         superseded = {names.TAG_CURRENT: names.SUPERSEDED}
         child = current if parent is None else {**current, names.TAG_PARENT_RUN: parent.run_id}
-        for node_key, run in list((self._known or {}).items()):
-            if node_key:
-                self._mark(run, child if node_key in node_keys else superseded)
-            else:
-                self._mark(run, current)
-        for run in self._earlier:
-            self._mark(run, superseded)
+        wanted = [(run, superseded) for run in self._earlier]
+        for node_key, run in (self.known or {}).items():
+            tags = child if node_key in node_keys else superseded
+            wanted.append((run, tags if node_key else current))
+        for run, tags in wanted:
+            if changed := dict(tags.items() - run.tags.items()):
+                self._mark(run, changed)
 
-    def _mark(self, run: KnownRun, tags: Mapping[str, str]) -> None:
-        """Set the tags of a run that it does not have."""
-        changed = dict(tags.items() - run.tags.items())
-        if not changed:
-            return
+    def _mark(self, run: KnownRun, changed: Mapping[str, str]) -> None:
         try:
-            self.set_tags(run.run_id, changed)
+            self.log(run.run_id, tags=changed)
         except MlflowException as error:
             if not is_lasting(error):  # otherwise the run was deleted
                 raise
         run.tags.update(changed)
 
-    def keep_view(self, key: str, content: str) -> None:
-        """Save a view of the experiment's pages under `key`."""
-        self.client.set_experiment_tag(self.id, names.TAG_VIEW_PREFIX + key, content)
-
     # -- one run -----------------------------------------------------------------------------
 
     def last_steps(self, run_id: str) -> dict[str, int]:
-        """Last step of each metric of the run."""
         metrics = self.client.get_run(run_id).data.metrics
         return {
             name: max(point.step for point in self.client.get_metric_history(run_id, name))
@@ -290,16 +270,14 @@ class Experiment:
             left, given = [], []
         self.client.log_batch(run_id, metrics=metrics, params=left, tags=given)
 
-    def set_tags(self, run_id: str, tags: Mapping[str, str]) -> None:
-        """Set tags; existing tags of the same names are overwritten."""
-        self.log(run_id, tags=tags)
-
     def log_policy(self, run_id: str, content: bytes, tags: Mapping[str, str]) -> None:
         """Upload a policy as the logged model of a run with these tags, unless it was before."""
-        model, outputs = self._earlier_model(run_id), None
-        if model is None:
+        # An earlier attempt may have created the model.
+        of_run = f"tags.`{names.TAG_SOURCE_RUN}` = '{run_id}'"
+        found, outputs = self.client.search_logged_models([self.id], of_run, max_results=1), None
+        if not found:
             model = self._new_model(run_id, tags)
-        elif model.status == LoggedModelStatus.READY:
+        elif (model := found[0]).status == LoggedModelStatus.READY:
             return
         else:
             outputs = self.client.get_run(run_id).outputs
@@ -314,13 +292,6 @@ class Experiment:
         if not outputs or model.model_id not in [o.model_id for o in outputs.model_outputs]:
             self.client.log_outputs(run_id, [LoggedModelOutput(model.model_id, steps)])
         self.client.finalize_logged_model(model.model_id, LoggedModelStatus.READY)
-
-    def _earlier_model(self, run_id: str) -> LoggedModel | None:
-        """The run's logged model, if an earlier attempt has created it."""
-        found = self.client.search_logged_models(
-            [self.id], f"tags.`{names.TAG_SOURCE_RUN}` = '{run_id}'", max_results=1
-        )
-        return found[0] if found else None
 
     def _new_model(self, run_id: str, tags: Mapping[str, str]) -> LoggedModel:
         shown = {key: tags[key] for key in names.TAGS_OF_A_MODEL if key in tags}

@@ -76,13 +76,11 @@ class MlflowListener(Listener):
             self._mirror(node)
 
     def failed(self, node: Node, failure: Failure) -> None:
-        """End the run with its cause."""
         if not self.tracker.is_running(node.key):
             self._start(node)
         self.tracker.end(node.key, "FAILED", {names.TAG_FAILURE: failure.cause})
 
     def pruned(self, node: Node, reason: str) -> None:
-        """End a run that was stopped early, with the reason."""
         if self.tracker.is_running(node.key):
             self.tracker.end(node.key, "KILLED", {names.TAG_PRUNED: reason})
 

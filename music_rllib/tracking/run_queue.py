@@ -6,7 +6,6 @@ history of its checkpoint again, and a finished run has its whole history in the
 
 from __future__ import annotations
 
-import contextlib
 import threading
 import time
 from collections import deque
@@ -36,10 +35,6 @@ class StoredRun(NamedTuple):
     """Reads the policy; called after the histories of all runs were sent."""
 
 
-class _Cancelled(Exception):  # noqa: N818 - no error
-    """`RunQueue.cancel` was called."""
-
-
 class RunQueue:
     """Queues the records of one run, and sends them to MLflow in order.
 
@@ -62,9 +57,7 @@ class RunQueue:
         self._lock = threading.Lock()
         self._run: KnownRun | None = None
         self._last_steps: dict[str, int] = {}
-        """Last step that MLflow has of each metric."""
         self._ended = True
-        self._cancelled = False
         self._is_new = self._has_begun = False
         """Whether this process created the run, which has no params yet; or has begun it."""
         self._read_policy: Callable[[], bytes | None] | None = None
@@ -78,7 +71,6 @@ class RunQueue:
             self._records.append(self._send_start)
 
     def report(self, reports: Iterable[Report]) -> None:
-        """Add reports."""
         with self._lock:
             self._records.extend(reports)
 
@@ -101,7 +93,6 @@ class RunQueue:
             self._records.append(partial(self._experiment.keep_current, keys))
 
     def put_text(self, name: str, text: str) -> None:
-        """Add or replace the artifact `name`."""
         with self._lock:
             self._records.append(
                 lambda: self._experiment.client.log_text(self.attach().run_id, text, name)
@@ -111,27 +102,19 @@ class RunQueue:
 
     @property
     def is_running(self) -> bool:
-        """Whether the run has started and not ended."""
         return not self._ended
 
     @property
     def source(self) -> str | None:
-        """Key of the node that the run starts from."""
         return self._info.source_node
 
     @property
     def records(self) -> int:
-        """Number of records in the queue."""
         return len(self._records)
 
     def drop(self) -> None:
-        """Send none of the records in the queue."""
         with self._lock:
             self._records.clear()
-
-    def cancel(self) -> None:
-        """Send nothing after the current request."""
-        self._cancelled = True
 
     # -- sending -----------------------------------------------------------------------------
 
@@ -140,15 +123,14 @@ class RunQueue:
 
         Raises MLflow's error at the first record that fails.
         """
-        with contextlib.suppress(_Cancelled):
-            while not self._cancelled and (records := self._next()):
-                if (first := records[0]) == self._send_policy and not policy:
-                    return
-                if callable(first):
-                    first()
-                else:
-                    self._log([record for record in records if isinstance(record, Report)])
-                self._remove(records)
+        while records := self._next():
+            if (first := records[0]) == self._send_policy and not policy:
+                return
+            if callable(first):
+                first()
+            else:
+                self._log([record for record in records if isinstance(record, Report)])
+            self._remove(records)
 
     def attach(self, started: int | None = None, tags: Mapping[str, str] = {}) -> KnownRun:
         """The run in MLflow, which is found there or created.
@@ -226,7 +208,6 @@ class RunQueue:
             return
         run_id = self.attach().run_id
         if (policy := self._read_policy()) is not None:
-            self._check_cancelled()
             self._experiment.log_policy(run_id, policy, self._tags())
         self._experiment.client.delete_tag(run_id, names.TAG_INCOMPLETE)
 
@@ -256,15 +237,10 @@ class RunQueue:
                 last[metric.key] = metric.step
                 new.append(metric)
         for begin in range(0, len(new) or 1, MAX_METRICS):
-            self._check_cancelled()
             chunk = new[begin : begin + MAX_METRICS]
             self._experiment.log(run_id, metrics=chunk, params=params, tags=tags)
             params, tags = {}, {}
             self._last_steps.update((metric.key, metric.step) for metric in chunk)
-
-    def _check_cancelled(self) -> None:
-        if self._cancelled:
-            raise _Cancelled
 
     @property
     def _environment(self) -> str | None:

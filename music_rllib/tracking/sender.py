@@ -98,15 +98,12 @@ class Sender(Thread):
         return not self.pending()
 
     def stop(self) -> None:
-        """End the thread after the current request."""
+        """End the thread after the run that it is sending."""
         with self._change:
             self._stopped = True
-            for run in self._runs:
-                run.cancel()
             self._change.notify_all()
 
     def run(self) -> None:
-        """Send in rounds until stopped."""
         while self._wait_for_news():
             succeeded = self._send_round()
             with self._change:

@@ -9,7 +9,6 @@ import contextlib
 import os
 import shlex
 import shutil
-import socket
 import sqlite3
 import sys
 from contextlib import closing
@@ -59,12 +58,10 @@ class TrackingStore:
 
     @property
     def public_uri(self) -> str:
-        """The URI without user and password."""
         return redact(self.uri)
 
     @property
     def is_server(self) -> bool:
-        """Whether the store is an MLflow server, not a database."""
         return self.uri.startswith(("http://", "https://"))
 
     def ui_command(self) -> str:
@@ -177,16 +174,30 @@ def check_reachable(store: TrackingStore) -> None:
         return
     import requests
 
+    reason = None
     try:
         answer = _get(store, "health")
+        if answer.status_code == 403 and "host" in answer.text.lower():
+            reason = "it refuses this host name; start it with --allowed-hosts naming it"
+        elif answer.status_code >= 500:
+            reason = f"it answered with status {answer.status_code}"
+    except requests.Timeout:
+        reason = f"no answer within {CONNECT_SECONDS + ANSWER_SECONDS:.0f} s"
     except requests.RequestException as error:
-        raise _unreachable(store, _reason(store, error)) from error
-    if answer.status_code == 403 and "host" in answer.text.lower():
-        raise _unreachable(
-            store, "it refuses this host name; start it with --allowed-hosts naming it"
+        reason = f"no connection ({_cause(error)})"
+    if reason is not None:
+        raise TrackingError(
+            f"{_origin(store.uri)} must name an MLflow server that answers, got "
+            f"{store.public_uri}: {reason}. Start that server, correct the URI, or set it to null "
+            "for a local SQLite file."
         )
-    if answer.status_code >= 500:
-        raise _unreachable(store, f"it answered with status {answer.status_code}")
+
+
+def _cause(error: BaseException) -> str:
+    """The innermost error of a request, such as a refused connection or an unknown host."""
+    while error.__context__ is not None:
+        error = error.__context__
+    return redact(str(error))
 
 
 def mlflow_version(store: TrackingStore) -> str | None:
@@ -234,35 +245,11 @@ def _checked_scheme(uri: str) -> str:
     return scheme
 
 
-def _unreachable(store: TrackingStore, reason: str) -> TrackingError:
-    return TrackingError(
-        f"{_origin(store.uri)} must name an MLflow server that answers, got {store.public_uri}: "
-        f"{reason}. Start that server, correct the URI, or set it to null for a local SQLite file."
-    )
-
-
 def _origin(uri: str) -> str:
     """The setting of this URI, for messages."""
     if uri != database_url(os.environ.get(VARIABLE, "")):
         return SETTING
     return f"{SETTING} (from the environment variable {VARIABLE})"
-
-
-def _reason(store: TrackingStore, error: requests.RequestException) -> str:
-    import requests
-
-    host = urlsplit(store.uri).hostname or ""
-    if isinstance(error, requests.exceptions.SSLError):
-        return f"its certificate was not accepted ({redact(str(error))})"
-    if isinstance(error, requests.Timeout):
-        return f"no answer within {CONNECT_SECONDS + ANSWER_SECONDS:.0f} s"
-    try:
-        socket.getaddrinfo(host, None)
-    except OSError:
-        return f"the host name {host!r} cannot be resolved"
-    if "refused" in str(error):
-        return "the connection was refused"
-    return f"no connection ({redact(str(error))})"
 
 
 def empty_database(version: str) -> Path:

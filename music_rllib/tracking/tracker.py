@@ -113,12 +113,10 @@ class Tracker:
 
     @property
     def experiment_id(self) -> str:
-        """MLflow's id of the sweep's experiment."""
         return self._experiment.id
 
     @property
     def parent_run_id(self) -> str:
-        """MLflow's id of the parent run."""
         return self._parent.attach().run_id
 
     def start(self, run: RunInfo) -> None:
@@ -128,7 +126,6 @@ class Tracker:
         self._sender.add(queue)
 
     def log(self, node_key: str, reports: Sequence[Report]) -> None:
-        """Log reports of a started run."""
         queue = self._runs[node_key]
         queue.report(reports)
         self._sender.add(queue)
@@ -160,14 +157,13 @@ class Tracker:
             logger.warning("MLflow keeps the earlier run %s: %s", node_key, mlflow_reason(error))
 
     def leave(self, node_key: str) -> None:
-        """Send nothing more of a run."""
         if (queue := self._runs.pop(node_key, None)) is not None:
             queue.drop()
 
     def look_again(self) -> None:
         """Send what is waiting, and find the runs that other drivers have created meanwhile."""
         self._sender.flush(20.0)
-        self._experiment.look_again()
+        self._experiment.known = None
 
     def keep_current(self, node_keys: Iterable[str]) -> None:
         """Mark the runs of these nodes as the sweep's current runs, and all others as earlier."""
@@ -175,18 +171,12 @@ class Tracker:
         self._sender.add(self._parent)
 
     def put_sweep_artifact(self, name: str, content: str) -> None:
-        """Add or replace an artifact of the parent run."""
         self._parent.put_text(name, content)
         self._sender.add(self._parent)
 
     def is_running(self, node_key: str) -> bool:
-        """Whether a run was started and has not ended."""
         queue = self._runs.get(node_key)
         return queue is not None and queue.is_running
-
-    def run_id(self, node_key: str) -> str | None:
-        """MLflow's id of a run; None until the server has the run."""
-        return self._experiment.known_id(node_key)
 
     def keep_view(self, content: str, versions: Sequence[str]) -> None:
         """Save a view for `comparison_url`, if MLflow has one of these versions.
@@ -197,7 +187,8 @@ class Tracker:
         if not version.startswith(tuple(f"{known}." for known in versions)):
             return
         try:
-            self._experiment.keep_view(self.sweep_id, content)
+            key = names.TAG_VIEW_PREFIX + self.sweep_id
+            self._experiment.client.set_experiment_tag(self.experiment_id, key, content)
         except Exception as error:
             logger.warning("MLflow's page has no view of the sweep: %s", mlflow_reason(error))
         else:
@@ -209,7 +200,6 @@ class Tracker:
         return f"{self.store.pages}/#/experiments/{self.experiment_id}/runs?{query}"
 
     def pending(self) -> Pending:
-        """The number of records that MLflow does not have yet, and why."""
         return self._undelivered or self._sender.pending()
 
     def flush(self, timeout: float) -> bool:

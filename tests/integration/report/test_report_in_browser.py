@@ -358,7 +358,7 @@ def as_of(sweep: Sweep, time: int) -> Sweep:
     history = {}
     for metric, column in sweep.history.items():
         then = column.select((column.time < time) & np.isin(column.run, begun))
-        history[metric] = replace(then, run=np.searchsorted(begun, then.run))
+        history[metric] = then._replace(run=np.searchsorted(begun, then.run))
     runs = [sweep.runs[i] for i in begun]
     states = [run.status if (run.ended or time) < time else "RUNNING" for run in runs]
     runs = [replace(run, status=state) for run, state in zip(runs, states, strict=True)]

@@ -188,7 +188,7 @@ def test_a_sweep_as_mlflow_shows_it(storage: Path, tracker_on: MakeTracker) -> N
     cause = "ValueError: http://me:hunter2@host is down"
     tracker.end("fine", "FAILED", {names.TAG_FAILURE: cause})
     assert tracker.flush(20.0)
-    assert tracker.run_id("fine") is not None
+    assert tracker._experiment.known_id("fine") is not None
     deadline = time.monotonic() + 20
     while tracker._runs:
         assert time.monotonic() < deadline, "delivered runs stay in memory"
@@ -352,7 +352,7 @@ def test_a_reused_node_is_logged_once(storage: Path, tracker_on: MakeTracker) ->
     tracker.log("new", later([2000]))
     tracker.mirror(run_info("new", source_node="old"), lambda: StoredRun(later([2000])))
     tracker.close()
-    run_id = tracker.run_id("old")
+    run_id = tracker._experiment.known_id("old")
     again = tracker_on()
 
     def read() -> StoredRun:
@@ -360,7 +360,7 @@ def test_a_reused_node_is_logged_once(storage: Path, tracker_on: MakeTracker) ->
 
     again.mirror(run_info("old"), read)
     assert not again.close()
-    assert again.run_id("old") == run_id
+    assert again._experiment.known_id("old") == run_id
 
     client = client_of(storage)
     runs = runs_of(client)

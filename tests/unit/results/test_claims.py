@@ -70,14 +70,14 @@ def test_error_rates_and_coverage_are_nominal(
 def test_planned_seeds_detect_a_planted_effect(rng: np.random.Generator) -> None:
     """80% of studies with the planned number of seeds are right."""
     spread = float(np.hypot(SPREAD, np.sqrt(2 * 0.25 / 1000)))  # with the noise of the evaluations
-    seeds = s.seeds_for_difference(0.1, spread, paired=True)
+    seeds = s.seeds_needed(0.1, spread, paired=True)[0]
     assert seeds is not None
     better = c.contrast(*study(0.1, seeds, rng, paired=True), paired=True, margin=MARGIN)
     assert verdicts(better)[Verdict.SUPERIOR] == pytest.approx(0.84, abs=0.05)
     assert verdicts(better)[Verdict.WORSE] + verdicts(better)[Verdict.EQUIVALENT] < 0.002
     worse = c.contrast(*study(-0.1, seeds, rng, paired=True), paired=True, margin=MARGIN)
     assert verdicts(worse)[Verdict.WORSE] == pytest.approx(0.84, abs=0.05)
-    seeds = s.seeds_for_equivalence(MARGIN, spread, paired=True)
+    seeds = s.seeds_needed(MARGIN, spread, paired=True)[1]
     assert seeds is not None
     same = c.contrast(*study(0.0, seeds, rng, paired=True), paired=True, margin=MARGIN)
     assert verdicts(same)[Verdict.EQUIVALENT] == pytest.approx(0.82, abs=0.04)

@@ -16,7 +16,7 @@ from music_rllib.report.figures.choice import study_drawings
 from music_rllib.report.figures.draw import files
 from music_rllib.results.analysis_plan import AnalysisPlan, PlanVersion, checked_plans, with_plan
 from music_rllib.results.analysis_plan import as_document as plans_as_document
-from music_rllib.results.answer import answer, seeds_needed
+from music_rllib.results.answer import answer, power_in_words
 from music_rllib.results.claims import Verdict
 from music_rllib.results.data import Points, RunRecord, Sweep, columns
 from music_rllib.results.study import Study, alpha_lines, study_of
@@ -405,7 +405,7 @@ def test_conditions_at_a_bound_do_not_count_for_seeds_needed(
     ]
     found = study_of(sweep_of(runs, BEFORE))
     assert len(found.planned) == 1
-    assert seeds_needed(found.planned, found.means, 1) is None
+    assert power_in_words(found.planned, found.means, 1) is None
 
 
 def test_only_fresh_seeds_of_a_search_are_compared(
@@ -486,7 +486,7 @@ def test_runs_are_compared_over_the_planned_or_smallest_budget(rng: np.random.Ge
 def test_seeds_needed_are_unknown_at_a_bound(rng: np.random.Generator) -> None:
     def at(height: float) -> str:
         found = study_of(sweep_of(study({"1": height, "1.5": height}, 4, rng)))
-        return seeds_needed(found.claims, found.means, 1) or ""
+        return power_in_words(found.claims, found.means, 1) or ""
 
     assert "spread does not show" in at(0.0)
     assert "for 80% power" in at(0.3)
