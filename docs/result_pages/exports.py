@@ -13,12 +13,11 @@ from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment.plan import Node, Plan, make_plan
 from music_rllib.results.archive import (
     best_records,
-    history_of,
     is_archive,
     plan_versions,
     read_archive,
 )
-from music_rllib.results.data import Sweep
+from music_rllib.results.data import Sweep, history_of
 from music_rllib.version import ALGORITHM_VERSION
 
 ROOT = Path(__file__).parents[2]

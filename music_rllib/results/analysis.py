@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -68,10 +67,6 @@ class Scope:
     """Scores of the conditions that have a seed which has finished on every task of the scope."""
     compared: tuple[FinalScores, ...]
     """Scores of the conditions that may be compared: in a search, those on fresh seeds."""
-
-    @property
-    def pairs(self) -> tuple[tuple[FinalScores, FinalScores], ...]:
-        return tuple((second, first) for first, second in combinations(self.compared, 2))
 
 
 @dataclass(frozen=True, kw_only=True)

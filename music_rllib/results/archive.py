@@ -19,14 +19,12 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal, get_args
 
-import numpy as np
 import pyarrow as pa
 from pyarrow import compute, csv, parquet
 from pydantic import BaseModel, ConfigDict, Field
@@ -48,12 +46,13 @@ from music_rllib.limits import (
 from music_rllib.results.analysis_plan import PlanVersion, as_document, checked_plans
 from music_rllib.results.data import (
     Column,
-    History,
+    Place,
     ReportError,
     RunRecord,
     Sweep,
     by_metric,
     checked_searches,
+    history_of,
     joined,
 )
 
@@ -365,9 +364,6 @@ def _from_csv(source: pa.NativeFile, head: bytes, kinds: Mapping[str, pa.DataTyp
 
 # Merging ------------------------------------------------------------------------------------------
 
-Place = tuple[Sweep, int]
-"""An export, and the position of a run in it."""
-
 
 def merged(earlier: Sweep, later: Sweep) -> Sweep:
     """All runs of two exports of a sweep.
@@ -405,14 +401,3 @@ def best_records(sweeps: Iterable[Sweep]) -> dict[str, Place]:
             if run.is_finished or not other.runs[at].is_finished:
                 best[run.node_key] = (sweep, position)
     return best
-
-
-def history_of(places: Sequence[Place]) -> History:
-    """Metrics of the runs at `places`, numbered in that order."""
-    parts: defaultdict[str, list[Column]] = defaultdict(list)
-    for number, (sweep, position) in enumerate(places):
-        for metric in sweep.history:
-            part = sweep.column(position, metric)
-            if len(part.run):
-                parts[metric].append(part._replace(run=np.full_like(part.run, number)))
-    return {metric: joined(parts[metric]) for metric in sorted(parts)}

@@ -171,6 +171,10 @@ def _stage(
     )
 
 
+def _order(q: str, others: Values) -> tuple[object, ...]:
+    return _number(q), tuple((name, _number(value)) for name, value in others)
+
+
 def _varying(runs: Sequence[tuple[str, Mapping[str, str]]]) -> list[str]:
     """Settings with more than one value on the same task, from (task, settings) pairs."""
     values: defaultdict[tuple[str, str], set[str]] = defaultdict(set)
@@ -211,10 +215,6 @@ def _settings(run: RunRecord) -> dict[str, tuple[str, str]]:
         _, before = settings.get(name, ("", ""))
         settings[name] = (run.tags.get(tag, value), f"{before}, {part}".removeprefix(", "))
     return settings
-
-
-def _order(q: str, others: Values) -> tuple[object, ...]:
-    return (_number(q), tuple((name, _number(value)) for name, value in others))
 
 
 def _number(text: str) -> tuple[float, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
@@ -200,8 +201,8 @@ class Sweep:
 
     def series(self, run: int, metric: str) -> tuple[Ints, Array]:
         """Steps and values of a metric of `runs[run]`, `[points]` each, possibly empty."""
-        column = self.column(run, metric)
-        return column.step, column.value
+        _, steps, values, _ = self.column(run, metric)
+        return steps, values
 
     def finite(self, run: int, metric: str) -> tuple[Array, Array]:
         """Finite part of `series`, with the steps as floats."""
@@ -229,15 +230,9 @@ class Sweep:
 
     def having(self, wanted: Callable[[RunRecord], bool]) -> Sweep:
         """The sweep with the runs for which `wanted` is true."""
-        kept = np.array([wanted(run) for run in self.runs], dtype=bool)
-        position = np.cumsum(kept) - 1
-        history = {
-            metric: chosen._replace(run=position[chosen.run])
-            for metric, column in self.history.items()
-            if len((chosen := column.select(kept[column.run])).run)
-        }
-        runs = [run for run, is_kept in zip(self.runs, kept, strict=True) if is_kept]
-        return replace(self, runs=runs, history=history)
+        kept = [position for position, run in enumerate(self.runs) if wanted(run)]
+        history = history_of([(self, position) for position in kept])
+        return replace(self, runs=[self.runs[position] for position in kept], history=history)
 
     def on(self, task: str) -> list[int]:
         return [position for position, run in enumerate(self.runs) if run.task == task]
@@ -249,14 +244,14 @@ class Sweep:
 
     def episodes(self, runs: Iterable[int]) -> float:
         """Mean number of episodes of the runs' last evaluations; infinite if unknown."""
-        counts = [self.final(run, names.EVAL_EPISODES) for run in runs]
+        counts = (self.final(run, names.EVAL_EPISODES) for run in runs)
         known = [count for count in counts if count is not None]
         return float(np.mean(known)) if known else np.inf
 
     def last_step(self, run: int) -> int:
         """Environment steps of the last value of `runs[run]`; 0 without one."""
-        steps = (self.column(run, metric).step for metric in self.history)
-        return max((int(of_metric[-1]) for of_metric in steps if len(of_metric)), default=0)
+        steps = (column.of_run(run).step for column in self.history.values())
+        return max((int(step.max(initial=0)) for step in steps), default=0)
 
     def least_budget(self, task: str, runs: Iterable[int]) -> float:
         """The smallest budget of these runs on a task in environment steps; infinite without runs.
@@ -265,6 +260,21 @@ class Sweep:
         """
         own = [run for run in runs if self.runs[run].task == task]
         return min((float(self.runs[r].budget or self.last_step(r)) for r in own), default=np.inf)
+
+
+Place = tuple[Sweep, int]
+"""A sweep, and the position of a run in it."""
+
+
+def history_of(places: Iterable[Place]) -> History:
+    """Metrics of the runs at `places`, numbered in that order."""
+    parts: defaultdict[str, list[Column]] = defaultdict(list)
+    for number, (sweep, position) in enumerate(places):
+        for metric, column in sweep.history.items():
+            part = column.of_run(position)
+            if len(part.run):
+                parts[metric].append(part._replace(run=np.full_like(part.run, number)))
+    return {metric: joined(parts[metric]) for metric in sorted(parts)}
 
 
 def with_pretraining(sweep: Sweep) -> Sweep:
@@ -383,8 +393,7 @@ class LastValues:
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
-        self._runs: dict[str, RunRecord] = {}
-        """Cached runs by node key: describing a run is the expensive part."""
+        self._runs: dict[str, RunRecord] = {}  # describing a run is the expensive part
 
     def sweep(self, results: Mapping[str, RunResult]) -> Sweep:
         """The runs that are planned so far, with `results` by node key."""

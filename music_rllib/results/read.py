@@ -53,13 +53,6 @@ class SweepRead:
     """A sentence about finished runs with damaged files; None if there are none."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class StoredSweep(SweepRead):
-    """A sweep that was read from its storage."""
-
-    opened: OpenSweep
-
-
 def read_sweep(
     place: str,
     storage: str | None = None,
@@ -88,8 +81,9 @@ def read_sweep(
 
 def read_stored(
     location: SweepLocation, *, metrics: Collection[str] | None = None, lenient: bool = False
-) -> StoredSweep:
+) -> SweepRead:
     """Read a sweep from its storage; see :func:`read_sweep`."""
+    metrics = None if metrics is None else frozenset(metrics)
     opened = open_started(location, lenient=lenient)
     state = location.read(sweep_files.STATE) or _NOT_STARTED
     found = list(opened.store.map(_reader(opened, state, metrics, lenient), opened.plan.nodes))
@@ -109,7 +103,7 @@ def read_stored(
         plans=plans_in(location.storage, location.name),
         earlier=earlier_text(location),
     )
-    return StoredSweep(
+    return SweepRead(
         sweep=sweep,
         folder=sweep_folder(location.storage, location.name),
         opened=opened,
@@ -217,21 +211,21 @@ def _with_history(
             return run, Points()
         times = [report["timestamp_ms"] for report in reports]
         began = round(times[0] - 1000 * reports[0]["seconds"])
-        rows = [(name, 0, began, value) for name, value in run_info(node).settings.items()]
-        rows += [
-            (name, report["env_steps"], report["timestamp_ms"], value)
-            for report in reports
-            for name, value in (
-                *report["metrics"].items(),
-                (names.SYSTEM_SECONDS, report["seconds"]),
-            )
+        measured = [(0, began, run_info(node).settings)]
+        for report in reports:
+            values = {**report["metrics"], names.SYSTEM_SECONDS: report["seconds"]}
+            measured.append((report["env_steps"], report["timestamp_ms"], values))
+        rows = [
+            (name, step, time, value)
+            for step, time, values in measured
+            for name, value in values.items()
+            if metrics is None or name in metrics
         ]
-        wanted = [row for row in rows if metrics is None or row[0] in metrics]
         points = Points(
-            [name for name, *_ in wanted],
-            np.array([step for _, step, *_ in wanted], np.int64),
-            np.array([time for *_, time, _ in wanted], np.int64),
-            np.array([value for *_, value in wanted], np.float64),
+            [name for name, *_ in rows],
+            np.array([step for _, step, *_ in rows], np.int64),
+            np.array([time for *_, time, _ in rows], np.int64),
+            np.array([value for *_, value in rows], np.float64),
         )
         seconds = float(reports[-1]["seconds"])
     except (ValueError, TypeError, KeyError, AttributeError) as error:

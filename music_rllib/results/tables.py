@@ -12,6 +12,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -287,7 +288,7 @@ def performance_tables(analyses: Sequence[StageAnalysis]) -> list[Table]:
                     Share(st.improvement(first.scores, second.scores)),
                 )
                 for analysis, scope in scopes
-                for first, second in scope.pairs
+                for second, first in combinations(scope.compared, 2)
             ],
             note="Differences of the means, without a test. Probability of improvement: a run of "
             "the first condition ends higher than a run of the second (ties count half).",

@@ -44,65 +44,65 @@ class RunQueue:
     """
 
     def __init__(
-        self, experiment: Experiment, node_key: str = "", sweep_tags: Mapping[str, str] = {}
+        self,
+        experiment: Experiment,
+        node_key: str = "",
+        sweep_tags: Mapping[str, str] = {},
+        added: Callable[[RunQueue], None] = lambda run: None,
     ) -> None:
-        """Send to a run of `experiment`, which also gets the tags `sweep_tags`."""
+        """Send to a run of `experiment`, which also gets the tags `sweep_tags`.
+
+        `added` is called after something was added to the queue.
+        """
         self.node_key = node_key
         self.refused: str | None = None
         """Reason of a lasting failure, after which nothing more is sent."""
-        self._experiment = experiment
-        self._sweep_tags = sweep_tags
+        self.is_running = False
+        """Whether the run has started and not ended."""
+        self._experiment, self._sweep_tags, self._added = experiment, sweep_tags, added
         self._info: RunInfo
         self._records: deque[Record] = deque()
         self._lock = threading.Lock()
         self._run: KnownRun | None = None
         self._last_steps: dict[str, int] = {}
-        self._ended = True
         self._is_new = self._has_begun = False
         """Whether this process created the run, which has no params yet; or has begun it."""
         self._read_policy: Callable[[], bytes | None] | None = None
 
     # -- adding to the queue -----------------------------------------------------------------
 
+    def _add(self, *records: Record) -> None:
+        with self._lock:
+            self._records.extend(records)
+        self._added(self)
+
     def start(self, info: RunInfo) -> None:
         """The run starts or is resumed; its reports follow, from the first one on."""
-        with self._lock:
-            self._info, self._ended = info, False
-            self._records.append(self._send_start)
+        self._info, self.is_running = info, True
+        self._add(self._send_start)
 
     def report(self, reports: Iterable[Report]) -> None:
-        with self._lock:
-            self._records.extend(reports)
+        self._add(*reports)
 
     def end(self, status: Status, tags: Mapping[str, str]) -> None:
         """The run ends without a result in the store."""
-        with self._lock:
-            self._records.append(partial(self._send_end, status, _now(), tags))
-            self._ended = True
+        self.is_running = False
+        self._add(partial(self._send_end, status, _now(), tags))
 
     def mirror(self, info: RunInfo, read: Callable[[], StoredRun]) -> None:
         """The run is in the store: the result of `read` replaces all records in the queue."""
-        with self._lock:
-            self._info, self._ended = info, True
-            self._records = deque([partial(self._send_stored, read), self._send_policy])
+        self._info, self.is_running = info, False
+        self.drop()
+        self._add(partial(self._send_stored, read), self._send_policy)
 
     def keep_current(self, node_keys: Iterable[str]) -> None:
         """The sweep, whose parent run this is, has the runs of these nodes and no others."""
-        with self._lock:
-            keys = frozenset(node_keys)
-            self._records.append(partial(self._experiment.keep_current, keys))
+        self._add(partial(self._experiment.keep_current, frozenset(node_keys)))
 
     def put_text(self, name: str, text: str) -> None:
-        with self._lock:
-            self._records.append(
-                lambda: self._experiment.client.log_text(self.attach().run_id, text, name)
-            )
+        self._add(lambda: self._experiment.client.log_text(self.attach().run_id, text, name))
 
     # -- state -------------------------------------------------------------------------------
-
-    @property
-    def is_running(self) -> bool:
-        return not self._ended
 
     @property
     def source(self) -> str | None:

@@ -103,12 +103,11 @@ class Tracker:
         )
         record.write(storage)  # before MLflow has anything that must be found again
         self._experiment = Experiment(self.store, sweep_name, self.sweep_id, _plan_key(config))
-        self._parent = self._parent_run(config)
-        replace(record, experiment_id=self.experiment_id, run_id=self.parent_run_id).write(storage)
         # A SQLite file has one writer at a time.
         at_once = REQUESTS_AT_ONCE if self.store.is_server else 1
         self._sender = Sender(self.store.public_uri, at_once)
-        self._sender.add(self._parent)
+        self._parent = self._parent_run(config)
+        replace(record, experiment_id=self.experiment_id, run_id=self.parent_run_id).write(storage)
         self._sender.start()
 
     @property
@@ -121,14 +120,10 @@ class Tracker:
 
     def start(self, run: RunInfo) -> None:
         """A run starts or is resumed; all its reports follow, from the first one on."""
-        queue = self._queue(run.node_key)
-        queue.start(run)
-        self._sender.add(queue)
+        self._queue(run.node_key).start(run)
 
     def log(self, node_key: str, reports: Sequence[Report]) -> None:
-        queue = self._runs[node_key]
-        queue.report(reports)
-        self._sender.add(queue)
+        self._runs[node_key].report(reports)
 
     def end(self, node_key: str, status: Status, tags: Mapping[str, str] | None = None) -> None:
         """End a started run that has no result in the store; `tags` say why.
@@ -136,18 +131,14 @@ class Tracker:
         The status of a stopped run that can be resumed is KILLED.
         """
         short = {key: redact(value)[:MAX_CAUSE_LENGTH] for key, value in (tags or {}).items()}
-        queue = self._runs[node_key]
-        queue.end(status, short)
-        self._sender.add(queue)
+        self._runs[node_key].end(status, short)
 
     def mirror(self, run: RunInfo, read: Callable[[], StoredRun]) -> None:
         """Log a finished run of the store, from this sweep or an earlier one.
 
         The sending thread calls `read`, unless MLflow has all of the run already.
         """
-        queue = self._queue(run.node_key)
-        queue.mirror(run, read)
-        self._sender.add(queue)
+        self._queue(run.node_key).mirror(run, read)
 
     def forget(self, node_key: str) -> None:
         """Delete the MLflow run of a node that is trained again; errors are only logged."""
@@ -168,11 +159,9 @@ class Tracker:
     def keep_current(self, node_keys: Iterable[str]) -> None:
         """Mark the runs of these nodes as the sweep's current runs, and all others as earlier."""
         self._parent.keep_current(node_keys)
-        self._sender.add(self._parent)
 
     def put_sweep_artifact(self, name: str, content: str) -> None:
         self._parent.put_text(name, content)
-        self._sender.add(self._parent)
 
     def is_running(self, node_key: str) -> bool:
         queue = self._runs.get(node_key)
@@ -228,7 +217,6 @@ class Tracker:
                 if queue.is_running:
                     self.end(node_key, "KILLED")
             self._parent.end(status, {})
-            self._sender.add(self._parent)
             with contextlib.suppress(*(() if say is None else (KeyboardInterrupt,))):
                 self._sender.flush(timeout, say)
             self._sender.stop()
@@ -263,7 +251,8 @@ class Tracker:
 
     def _parent_run(self, config: Mapping[str, object]) -> RunQueue:
         """The parent run. It is created at once, as its children need its id."""
-        parent = RunQueue(self._experiment, "", {names.TAG_SWEEP: self._name})
+        sweep = {names.TAG_SWEEP: self._name}
+        parent = RunQueue(self._experiment, "", sweep, self._sender.add)
         parent.start(RunInfo(node_key="", name=self._name, config=config))
         parent.put_text(names.ARTIFACT_SWEEP_CONFIG, _as_yaml(config))
         with answers_named(self.store, "accept the sweep's run"):
@@ -273,7 +262,8 @@ class Tracker:
     def _queue(self, node_key: str) -> RunQueue:
         if (queue := self._runs.get(node_key)) is None:
             tags = {names.TAG_SWEEP: self._name, names.TAG_PARENT_RUN: self.parent_run_id}
-            queue = self._runs[node_key] = RunQueue(self._experiment, node_key, tags)
+            queue = RunQueue(self._experiment, node_key, tags, self._sender.add)
+            self._runs[node_key] = queue
         return queue
 
 

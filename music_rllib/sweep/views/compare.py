@@ -15,7 +15,7 @@ from music_rllib.results.analysis import analyse_stage, mixed
 from music_rllib.results.answer import answer, study_data
 from music_rllib.results.conditions import find_stages
 from music_rllib.results.data import Sweep
-from music_rllib.results.read import StoredSweep, read_stored
+from music_rllib.results.read import SweepRead, read_stored
 from music_rllib.results.study import study_of
 from music_rllib.results.tables import performance_tables, study_tables
 from music_rllib.search.best import ranking_metric
@@ -89,8 +89,8 @@ def _environments(sweep: Sweep, stage: str) -> list[str]:
     )
 
 
-def _check_metric(read: StoredSweep, metric: str) -> None:
-    if metric not in read.sweep.history and any(read.opened.finished):
+def _check_metric(read: SweepRead, metric: str) -> None:
+    if metric not in read.sweep.history and read.opened is not None and any(read.opened.finished):
         results = read.opened.results().values()
         known = sorted({name for result in results for name in result.metrics})
         raise BadInputError(f"--metric must be one of {', '.join(known)}, got {metric!r}")

@@ -197,7 +197,7 @@ TRIALS = [("1", 0, "trial0", 0.5), ("1.2", 0, "trial1", 1.0), ("1.4", 0, "trial2
 def test_trials_of_a_search_are_not_compared_on_its_seeds() -> None:
     sweep = searched(*TRIALS)
     (analysis,) = analyse(sweep)
-    assert analysis.scopes[0].pairs == ()
+    assert len(analysis.scopes[0].compared) < 2
     assert len(analysis.scopes[0].finals) == 3, "the table has them"
     assert "No run that may be compared has finished yet." in answer_to(sweep)
 
