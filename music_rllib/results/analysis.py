@@ -126,12 +126,9 @@ def analyse(sweep: Sweep) -> list[StageAnalysis]:
 
 
 def analyse_stage(sweep: Sweep, stage: StageRuns, metric: str | None = None) -> StageAnalysis:
-    """Compute the statistics of one stage, with the final values of `metric`.
+    """Compute the statistics of one stage.
 
-    Args:
-        sweep: The runs.
-        stage: The stage.
-        metric: The metric of final values; None: each task's primary one.
+    Its final values are those of `metric`; None: of each task's primary one.
     """
     scopes = stage_scopes(sweep, stage, metric)
     rated = [task for task in stage.tasks if sweep.primary_metric(task) == names.EVAL_SUCCESS]
@@ -161,12 +158,8 @@ def analyse_stage(sweep: Sweep, stage: StageRuns, metric: str | None = None) -> 
 def stage_scopes(sweep: Sweep, stage: StageRuns, metric: str | None = None) -> tuple[Scope, ...]:
     """Final values of a stage's conditions: a scope for each task.
 
-    The first scope covers all tasks if their metric has the same unit.
-
-    Args:
-        sweep: The runs.
-        stage: The stage.
-        metric: The metric to read; None: each task's primary one.
+    The first scope covers all tasks if their metric has the same unit. If `metric` is None, it is
+    each task's primary one.
     """
     metrics = {task: metric or sweep.primary_metric(task) for task in stage.tasks}
     parts = {task: {task: own} for task, own in metrics.items()}
@@ -183,15 +176,10 @@ def stage_scopes(sweep: Sweep, stage: StageRuns, metric: str | None = None) -> t
 
 
 def _final(sweep: Sweep, condition: Condition, metrics: Mapping[str, str]) -> FinalScores | None:
-    """Last values of a condition's finished runs; None without any.
+    """Last values of a condition's finished runs, by the metric of each task; None without any.
 
     A seed that has not finished on every task is left out; otherwise tasks would have unequal
     weights.
-
-    Args:
-        sweep: The runs.
-        condition: The condition.
-        metrics: Task to metric, for T tasks.
     """
     by_seed: defaultdict[str, dict[str, float]] = defaultdict(dict)
     for run in condition.runs:

@@ -208,12 +208,7 @@ def power_in_words(claims: Sequence[Claim], means: Sequence[Mean], family: int) 
     """How many seeds would decide; None without a margin or a known spread.
 
     Conditions within the margin of a bound are left out: their seeds differ less than others.
-
-    Args:
-        claims: Claims whose spread counts.
-        means: Mean scores of the conditions.
-        family: Number of comparisons that are tested together; Holm's method tests the first of
-            them at 0.05 / family.
+    Holm's method tests the first of `family` comparisons at 0.05 / family.
     """
     margin = max((claim.margin for claim in claims if claim.margin is not None), default=None)
     if margin is None:

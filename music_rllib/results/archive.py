@@ -1,17 +1,7 @@
 """Exports: a sweep as a folder of plain tables, readable without this package.
 
-`sweep.json`
-    Name, status, tags and configuration of the sweep.
-`runs.csv` or `runs.parquet`
-    One row per run: its number, its key, and a column per tag (`tag.`) and param (`param.`).
-`metrics.csv` or `metrics.parquet`
-    One row per value: number of the run, metric, environment steps, value, time in ms.
-`search.json`
-    For a search: trials, importance of settings, ranking on fresh seeds.
-`analysis_plan.json`
-    For a sweep with a plan: its versions, each with the time at which it was recorded.
-
-Exports of several machines, sittings and sweeps can be merged into one sweep.
+docs/reports.md describes the files. Exports of several machines, sittings and sweeps can be merged
+into one sweep.
 """
 
 from __future__ import annotations
@@ -127,7 +117,7 @@ def write_archive(sweep: Sweep, folder: Path, file_format: Format = "parquet") -
         with TemporaryDirectory(dir=folder, prefix=".new-") as temporary:
             new = Path(temporary)
             write_table(_runs_table(sweep.runs), new / f"runs.{file_format}")
-            write_table(_metrics_table(sweep), new / f"metrics.{file_format}")
+            write_table(metrics_table(sweep), new / f"metrics.{file_format}")
             if sweep.searches:
                 _write_json([_without_place(found) for found in sweep.searches], new / _SEARCHES)
             if sweep.plans:
@@ -214,7 +204,8 @@ def _runs_table(runs: Sequence[RunRecord]) -> pa.Table:
     return pa.Table.from_pylist(rows, schema)
 
 
-def _metrics_table(sweep: Sweep) -> pa.Table:
+def metrics_table(sweep: Sweep) -> pa.Table:
+    """Every value of every metric, with the number of its run."""
     every = joined(sweep.history.values())
     metric = [pa.repeat(name, len(column.run)) for name, column in sweep.history.items()]
     return pa.table(

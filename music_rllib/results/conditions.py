@@ -202,19 +202,15 @@ def _all_settings(records: Sequence[RunRecord]) -> list[dict[str, str]]:
 
 def _settings(run: RunRecord) -> dict[str, tuple[str, str]]:
     """Settings that can tell conditions apart, in words and in full; not the seed or the task."""
-    settings: dict[str, tuple[str, str]] = {}
+    words: dict[str, str] = {}
+    full: defaultdict[str, list[str]] = defaultdict(list)
     for param, value in sorted(run.params.items()):
-        if param == "seed" or param.startswith("task."):
-            continue
-        whole = whole_setting(param)
-        if whole not in IN_WORDS:
-            settings[param] = (value, value)
-            continue
-        name, tag = IN_WORDS[whole]
-        part = f"{param.removeprefix(whole).removeprefix('.')} {value}".strip()
-        _, before = settings.get(name, ("", ""))
-        settings[name] = (run.tags.get(tag, value), f"{before}, {part}".removeprefix(", "))
-    return settings
+        if param != "seed" and not param.startswith("task."):
+            whole = whole_setting(param)
+            name, tag = IN_WORDS.get(whole, (param, ""))
+            words[name] = run.tags.get(tag, value)
+            full[name].append(f"{param.removeprefix(whole).removeprefix('.')} {value}".strip())
+    return {name: (words[name], ", ".join(full[name])) for name in words}
 
 
 def _number(text: str) -> tuple[float, str]:

@@ -88,8 +88,8 @@ def by_metric(metrics: pa.ChunkedArray, values: Column) -> dict[str, Column]:
     coded = metrics.combine_chunks().dictionary_encode()
     codes = coded.indices.to_numpy(zero_copy_only=False)
     order = np.lexsort((values.time, values.step, values.run, codes))
-    keys = np.stack((codes, values.run, values.step))[:, order]
-    order = order[np.append((np.diff(keys) != 0).any(axis=0), True)[: len(order)]]
+    changes = [np.diff(key[order]) != 0 for key in (codes, values.run, values.step)]
+    order = order[np.append(np.any(changes, axis=0), True)[: len(order)]]
     ends = np.searchsorted(codes[order], np.arange(len(coded.dictionary) + 1))
     found = sorted((name, code) for code, name in enumerate(coded.dictionary.to_pylist()))
     return {name: values.select(order[ends[code] : ends[code + 1]]) for name, code in found}

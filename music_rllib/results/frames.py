@@ -6,13 +6,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import pandas as pd
 
 from music_rllib import names
 from music_rllib.results.analysis import analyse
+from music_rllib.results.archive import metrics_table
 from music_rllib.results.conditions import find_stages
-from music_rllib.results.data import Sweep, joined
+from music_rllib.results.data import Sweep
 from music_rllib.results.read import read_sweep
 
 if TYPE_CHECKING:
@@ -140,16 +140,9 @@ def _typed(texts: pd.Series[Any]) -> Any:
 
 
 def _curves(sweep: Sweep, keys: list[str]) -> pd.DataFrame:
-    every = joined(sweep.history.values())
-    counts = [len(column.run) for column in sweep.history.values()]
-    rows = {
-        "key": pd.Series(keys, dtype="str").take(every.run).array,
-        "metric": np.repeat(np.array(list(sweep.history), str), counts),
-        "env_steps": every.step,
-        "value": every.value,
-        "time": every.time,
-    }
-    return _frame(rows, _CURVE_COLUMNS)
+    values = metrics_table(sweep).to_pandas().rename(columns={"time_ms": "time"})
+    values["key"] = pd.Series(keys, dtype="str").take(values["run"]).array
+    return _frame(values, _CURVE_COLUMNS)
 
 
 def _conditions(sweep: Sweep) -> Iterator[dict[str, Any]]:
@@ -180,12 +173,5 @@ def _conditions(sweep: Sweep) -> Iterator[dict[str, Any]]:
 
 
 def _frame(rows: Any, columns: dict[str, str]) -> pd.DataFrame:
-    """A frame with these columns and types, even without rows."""
-    frame = pd.DataFrame(rows, columns=list(columns))
-    for name, kind in columns.items():
-        column = frame[name]
-        if kind.startswith("datetime"):
-            frame[name] = pd.to_datetime(column, unit="ms", utc=True).astype(kind)
-        else:
-            frame[name] = (pd.to_numeric(column) if kind == "Int64" else column).astype(kind)
-    return frame
+    """A frame with these columns and types, even without rows; times are in ms."""
+    return pd.DataFrame(rows, columns=list(columns)).astype(columns)

@@ -94,7 +94,7 @@ def measure_on(
         sweep: The runs.
         task: The task.
         runs: Positions of all runs that are compared.
-        kind: `auc`, `auc_total` or `final`.
+        kind: As in `Measure`, like `maximised`.
         metric: The metric; None: the task's primary one.
         maximised: Whether higher values are better.
         horizon: Largest number of environment steps.
