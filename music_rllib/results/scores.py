@@ -148,41 +148,40 @@ def scores_of(sweep: Sweep, condition: Condition, task: str, measure: Measure) -
     A failed run has the worst score: without it, a condition would look better the more of its runs
     fail. An unfinished run has no score.
     """
-    by_seed: dict[str, float] = {}
-    episodes, noise, failed, unfinished = [], [], 0, 0
-    for run in condition.runs:
-        record = sweep.runs[run]
-        if record.task != task:
-            continue
-        if _has_failed(sweep, run, measure.metric):
-            if np.isfinite(measure.worst):
-                by_seed[record.seed] = measure.worst
-                failed += 1
-            continue
-        unfinished += not record.is_finished
-        score = _score(sweep, run, measure)
-        if np.isnan(score):
-            continue
-        by_seed[record.seed] = score
-        steps, values = sweep.finite(run, measure.metric)
-        whole = measure.kind != "final" and measure.horizon > 0
-        used = values[steps <= measure.horizon] if whole else values[-1:]
-        of_one = sweep.final(run, names.EVAL_EPISODES)
-        if of_one is None:
-            episodes.append(np.inf)
-        else:
-            episodes.append(of_one * len(used))
-            # Half an episode is added to both outcomes: a rate of 0 or 1 is not certain.
-            rates = (used * of_one + 0.5) / (of_one + 1)
-            noise.append(float(np.mean(rates * (1 - rates))) / max(of_one * len(used), 1))
+    runs = [run for run in condition.runs if sweep.runs[run].task == task]
+    failed = {run for run in runs if _has_failed(sweep, run, measure.metric)}
+    scores = {run: measure.worst if run in failed else _score(sweep, run, measure) for run in runs}
+    known = {run: score for run, score in scores.items() if np.isfinite(score)}
+    evaluated = [_evaluations(sweep, run, measure) for run in known if run not in failed]
+    noise = [_noise(*one) for one in evaluated if np.isfinite(one[1])] if measure.is_rate else []
     return Scores(
-        by_seed=by_seed,
-        episodes=float(np.mean(episodes)) if episodes else np.inf,
-        noise=float(np.mean(noise)) if noise and measure.is_rate else 0.0,
-        failed=failed,
-        runs=sum(sweep.runs[run].task == task for run in condition.runs),
-        unfinished=unfinished,
+        by_seed={sweep.runs[run].seed: score for run, score in known.items()},
+        episodes=float(np.mean([e * len(rates) for rates, e in evaluated]))
+        if evaluated
+        else np.inf,
+        noise=float(np.mean(noise)) if noise else 0.0,
+        failed=len(failed & known.keys()),
+        runs=len(runs),
+        unfinished=sum(not sweep.runs[run].is_finished for run in runs if run not in failed),
     )
+
+
+def _evaluations(sweep: Sweep, run: int, measure: Measure) -> tuple[Array, float]:
+    """The values behind a run's score, and the episodes of each; infinite if unknown."""
+    steps, values = sweep.finite(run, measure.metric)
+    whole = measure.kind != "final" and measure.horizon > 0
+    episodes = sweep.final(run, names.EVAL_EPISODES)
+    used = values[steps <= measure.horizon] if whole else values[-1:]
+    return used, np.inf if episodes is None else episodes
+
+
+def _noise(rates: Array, episodes: float) -> float:
+    """Variance of a mean of rates from their episodes alone.
+
+    Half an episode is added to both outcomes: a rate of 0 or 1 is not certain.
+    """
+    rates = (rates * episodes + 0.5) / (episodes + 1)
+    return float(np.mean(rates * (1 - rates))) / max(episodes * len(rates), 1)
 
 
 def area_under_curve(steps: Array, values: Array, horizon: float) -> float:
