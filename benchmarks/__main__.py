@@ -25,6 +25,7 @@ GROUPS = {
     "environment": "environment",
     "replay": "sampling",
     "training": "whole_training",
+    "success": "time_to_success",
     "checkpoint": "checkpoint",
     "memory": "memory",
     "sweep": "sweep",

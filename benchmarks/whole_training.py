@@ -15,7 +15,7 @@ import psutil
 
 from benchmarks.measure import Row, Taken, compared, middle, ratio_row, told_turns
 
-__all__ = ["rows"]
+__all__ = ["is_installed", "rows"]
 
 GROUP = "whole training"
 SECONDS = 10.0
@@ -92,7 +92,7 @@ class Peer:
 def rows(repeats: int) -> Iterator[Row]:
     """Speeds at equal networks, batch and replay ratio; programs of a setting take turns."""
     for (width, ratio), targets in SETTINGS.items():
-        names = ["ours", *(name for name in targets if _is_installed(OTHERS[name]))]
+        names = ["ours", *(name for name in targets if is_installed(OTHERS[name]))]
         what = f"3 x {width}, replay ratio {ratio:g}"
         print(f"  {what}: {', '.join(names)}", file=sys.stderr, flush=True)
         taken = _in_turns(names, width, ratio, repeats)
@@ -126,5 +126,6 @@ def _row(
     )  # fmt: skip
 
 
-def _is_installed(package: str) -> bool:
+def is_installed(package: str) -> bool:
+    """Whether a program to compare with is here."""
     return importlib.util.find_spec(package) is not None
