@@ -97,7 +97,8 @@ All problems of a file are reported at once, before anything starts, each with f
 and value. Files follow YAML 1.2: `1e-3` is a number and `no` is text. `1e6` is accepted as an
 integer. Repeated and unknown keys are errors.
 
-`preset: small` (for two cores), `paper`, `music-2021` or `tac-2020` uses the settings of a file in
+`preset: small` (for two cores), `sample-efficient` (with symmetries of the task), `paper`,
+`music-2021` or `tac-2020` uses the settings of a file in
 [music_rllib/presets](../music_rllib/presets), which documents the source of its numbers.
 `music-rllib presets` lists the presets.
 
