@@ -201,12 +201,9 @@ class PolicyNetwork:
                 layer_norm=header["format"] == LAYER_NORM_FORMAT,
                 about=header["about"],
             )
-        except KeyError as error:
-            raise PolicyFileError(f"{path} must be a policy, it lacks {error}") from None
-        except RecursionError:
-            raise PolicyFileError(f"{path} must be a policy: its header is too deep") from None
         except _UNREADABLE as error:
-            raise PolicyFileError(f"{path} must be a policy: {error}") from None
+            reason = f"it lacks {error}" if isinstance(error, KeyError) else error
+            raise PolicyFileError(f"{path} must be a policy: {reason}") from None
 
 
 def _normalized(hidden: Floats) -> Floats:
@@ -219,7 +216,7 @@ def _normalized(hidden: Floats) -> Floats:
 
 
 _UNREADABLE = (
-    *(OSError, ValueError, TypeError, IndexError, OverflowError),
+    *(OSError, ValueError, TypeError, LookupError, OverflowError, RecursionError),
     safetensors.SafetensorError,
 )
 

@@ -65,7 +65,6 @@ class Policy:
     seed: int
     node_key: str
     env_steps: int
-    """Environment steps of the training."""
     max_episode_steps: int
     """Steps after which episodes are truncated."""
     environment: Known | None

@@ -29,7 +29,6 @@ FRAMES_PER_SECOND = 20
 SIZE = 320
 """Width and height of the picture in pixels, without the lines of text above and below."""
 LINE = 26
-"""Height of a line of text in pixels."""
 HOLD = 12
 """Number of frames that repeat an episode's last picture."""
 

@@ -55,8 +55,7 @@ def answer(sweep: Sweep, study: Study) -> list[str]:
     if rest := [claim for claim in study.claims if claim not in shown[:MOST_CLAIMS]]:
         counts = Counter(str(claim.verdict) for claim in rest)
         verdicts = ", ".join(f"{n} {verdict}" for verdict, n in counts.items())
-        more = f"{len(rest)} more comparisons: {verdicts}"
-        sentences.append(f"{more}." if len(rest) > 1 else f"1 more comparison: {rest[0].verdict}.")
+        sentences.append(f"Further comparisons: {verdicts}.")
     sentences += [_metric(study, shown), _seeds(sweep, study, shown)]
     sentences.append(f"Control: {_control(sweep, study, study.stage)}.")
     undecided = (Verdict.UNDECIDED, Verdict.NONE)

@@ -222,7 +222,6 @@ class Claim:
     """The task, or `ALL_TASKS` for their mean."""
     measure: Measure
     margin: float | None
-    """Margin of equivalence; None without one."""
     contrast: Contrast
     pairs: Pairs = field(repr=False)
     """Pairs of conditions over which the difference is averaged."""

@@ -186,7 +186,6 @@ class Sweep:
     """Storage that the sweep was read from, without a password."""
     tags: Mapping[str, str] = field(default_factory=dict, repr=False)
     config: str | None = field(default=None, repr=False)
-    """The configuration as YAML; None if it was not kept."""
     runs: Sequence[RunRecord] = field(repr=False)
     history: History = field(repr=False)
     searches: Sequence[Mapping[str, Any]] = field(default=(), repr=False)

@@ -71,7 +71,6 @@ class Scores:
 
     @property
     def finished(self) -> int:
-        """Number of finished runs with a score."""
         return len(self.by_seed) - self.failed
 
 

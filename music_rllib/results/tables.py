@@ -329,7 +329,6 @@ def _thresholds(analyses: Sequence[StageAnalysis]) -> Table:
 
 # Searches ---------------------------------------------------------------------------------------
 _TRIALS = {"judged": "scored", "pruned": "stopped early", "failed": "failed"}
-"""Word for each state of a trial in `search.json`."""
 
 
 def search_in_words(search: Entry) -> str:

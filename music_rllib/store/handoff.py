@@ -87,7 +87,6 @@ class Spaces(_Strict):
 
     observation_size: int = Field(gt=0)
     goal_size: int = Field(ge=0)
-    """Size of a goal; 0 without goals."""
     action_low: tuple[float, ...] = Field(min_length=1)
     action_high: tuple[float, ...]
 

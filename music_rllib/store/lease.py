@@ -35,7 +35,6 @@ from music_rllib.store.storage import (
 EXPIRES_SECONDS = 60.0
 """Time until a lease expires; the clocks of machines must agree better than that."""
 RENEWALS = 4
-"""Number of renewals in that time."""
 SETTLE_SECONDS = 2.0
 """Wait between writing a lease into a bucket and reading it again."""
 LOCK_SECONDS, LOCK_ATTEMPTS = 30.0, 100
@@ -53,7 +52,6 @@ class Lease(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     owner: str
-    """Unique id of the owner."""
     what: str
     """Purpose of the lease, for messages."""
     host: str

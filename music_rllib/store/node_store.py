@@ -56,9 +56,7 @@ class NodeStore(SealedFolders):
         self._root = open_storage(uri)
         super().__init__(self._root / "nodes")
 
-    def is_finished(self, key: str) -> bool:
-        """Whether the node has been published."""
-        return self.exists(key)
+    is_finished = SealedFolders.exists
 
     def finished(self, keys: Iterable[str]) -> set[str]:
         """The published nodes among `keys`."""

@@ -22,14 +22,12 @@ class _Patience:
     say: Callable[[str], None] = lambda text: None
     """Receives the beginning and the end of an outage."""
     waits: bool = False
-    """Whether the bucket does not answer now."""
 
 
 _patience = _Patience()
 _FIRST_PAUSE, _LAST_PAUSE = 1.0, 30.0
 """Seconds between two attempts, which grow from the first to the last value."""
 _REFUSED = re.compile("ACCESS_DENIED|NO_SUCH_BUCKET|INVALID_ACCESS_KEY|SIGNATURE_DOES_NOT_MATCH")
-"""Errors of a bucket that answers."""
 
 
 def be_patient(minutes: float, say: Callable[[str], None] = lambda text: None) -> None:

@@ -210,7 +210,6 @@ class SealedFolders:
         return manifest
 
     def paths(self, name: str) -> list[str]:
-        """Paths of the manifest and of the folder's files."""
         manifest = self.manifest(name)
         own = [self._source(manifest, file) for file in sorted(manifest.files)]
         return [f"{self.path(name)}/{MANIFEST}", *own]

@@ -38,7 +38,6 @@ from music_rllib.tracking.store import TrackingStore, empty_database, keep_empty
 MAX_METRICS, MAX_PARAMS = 1000, 100
 """MLflow's limits for one request: metrics, or metrics, params and tags together; and params."""
 REQUEST_SECONDS = 30
-"""Timeout of one request, unless MLFLOW_HTTP_REQUEST_TIMEOUT sets another."""
 SCHEMA_SECONDS = 120.0
 """Longest wait for another process that creates the tables of the same SQLite file."""
 _LASTING_ERRORS = frozenset(
