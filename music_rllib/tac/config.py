@@ -155,7 +155,7 @@ class TACConfigBase(AlgorithmConfig):
 
     def replay(
         self, *, moved_distance: float | None = NotProvided,
-        task_symmetries: Symmetries = NotProvided, **settings: Any,
+        task_symmetries: Symmetries | Mapping[str, Any] = NotProvided, **settings: Any,
     ) -> Self:  # fmt: skip
         """Set the hyperparameters of replay and hindsight.
 
@@ -163,12 +163,15 @@ class TACConfigBase(AlgorithmConfig):
             moved_distance: for `hindsight_episodes: moved`, the distance from the first achieved
                 goal that counts as moved. None: the task's reward decides; with dense rewards, a
                 fifth of the environment's `distance_threshold`.
-            task_symmetries: symmetries of the environment, for the setting `symmetries`.
+            task_symmetries: symmetries of the environment, for the setting `symmetries`; or a
+                mapping as in a sweep's file.
             **settings: fields of `ReplaySettings`.
 
         Raises:
             TypeError: unknown setting.
         """
+        if task_symmetries is not NotProvided:
+            task_symmetries = Symmetries.model_validate(task_symmetries)
         fields = _prefixed("replay", settings, ReplaySettings)
         return self._set(fields, moved_distance=moved_distance, task_symmetries=task_symmetries)
 

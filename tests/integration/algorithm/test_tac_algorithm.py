@@ -91,7 +91,7 @@ def build(
     )
     config.reporting(min_sample_timesteps_per_iteration=1)
     config.training(**{**SMALL, "total_env_steps": 1_000, **settings})
-    symmetries = BUILT_IN_TASKS["FetchReach"].symmetries
+    symmetries = BUILT_IN_TASKS["FetchReach"].symmetries.model_dump()
     config.replay(**{"capacity": 10_000, "task_symmetries": symmetries, **replay})
     if music is not None:
         config.music(agent_indices=range(3), surrounding_indices=range(3, 6), **music)
