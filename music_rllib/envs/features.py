@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Sequence
-from typing import Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from music_rllib.limits import MOST_INDICES
-from music_rllib.replay.trajectories import ReplayLayout, Transitions
+
+if TYPE_CHECKING:
+    from music_rllib.replay.trajectories import ReplayLayout, Transitions
 
 _RANGE = re.compile(r"(\d{1,5}):(\d{1,5})")
 

@@ -196,6 +196,19 @@ def open_started(location: SweepLocation, *, lenient: bool = False) -> OpenSweep
     return open_sweep(config, plan, location.storage, lenient=lenient)
 
 
+def continued_runs_text(sweep: OpenSweep) -> list[str]:
+    """A line about runs that continue finished ones with fewer `env_steps`, if there are any."""
+    left = [node for node in sweep.plan.nodes if node.key not in sweep.finished]
+    steps = [done for node in left if (done := sweep.continued_from(node)) is not None]
+    if not steps:
+        return []
+    continues = "continues a finished run" if len(steps) == 1 else "continue finished runs"
+    return [
+        f"{in_runs(len(steps))} {continues} with fewer env_steps: {sum(steps):,} env steps less to "
+        "train."
+    ]
+
+
 def remove_damaged(sweep: OpenSweep, say: Callable[[str], None]) -> None:
     """Delete the damaged nodes, and print each; the caller must hold the sweep's lease."""
     for key, text in sweep.damaged.items():

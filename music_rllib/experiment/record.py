@@ -231,19 +231,6 @@ def _changed_searches(
             yield stage.name, list(dict.fromkeys(lines))
 
 
-def continued_runs_text(sweep: OpenSweep) -> list[str]:
-    """A line about runs that continue finished ones with fewer `env_steps`, if there are any."""
-    left = [node for node in sweep.plan.nodes if node.key not in sweep.finished]
-    steps = [done for node in left if (done := sweep.continued_from(node)) is not None]
-    if not steps:
-        return []
-    continues = "continues a finished run" if len(steps) == 1 else "continue finished runs"
-    return [
-        f"{in_runs(len(steps))} {continues} with fewer env_steps: {sum(steps):,} env steps less to "
-        "train."
-    ]
-
-
 def _why_not_continued(node: Node) -> str:
     """The reason why a run with more `env_steps` does not continue the shorter one."""
     if settings := budget_settings(node.run):

@@ -25,6 +25,7 @@ from music_rllib.experiment.open_sweep import (
     OpenSweep,
     accept_environments,
     changed_text,
+    continued_runs_text,
     decide,
     found_runs,
     open_sweep,
@@ -33,7 +34,6 @@ from music_rllib.experiment.open_sweep import (
     reopened,
 )
 from music_rllib.experiment.plan import make_plan, shared_runs
-from music_rllib.experiment.record import changes_since, continued_runs_text, keep_record
 from music_rllib.experiment.sweep_files import ANALYSIS_PLAN, STATE
 from music_rllib.redaction import redact
 from music_rllib.runtime.machine import (
@@ -51,6 +51,7 @@ from music_rllib.sweep.preflight import check_demand
 from music_rllib.sweep.views.plan import cluster_answer, plan_answer, plan_view
 
 if TYPE_CHECKING:
+    from music_rllib.experiment.record import Changes
     from music_rllib.runtime.ray_cluster import Capacity
 
 DEFAULT_CONFIG = Path(__file__).with_name("default.yaml")
@@ -88,7 +89,7 @@ def plan(config: SweepConfig, *, measure: bool = False, as_json: bool = False) -
     try:
         opened, cluster = _open(console, config, wait_minutes=0.0)
         preflight.check_searches(opened)
-        texts = filter(None, (changes_since(opened), changed_text(opened, found_runs(opened))))
+        texts = filter(None, (_changes(opened), changed_text(opened, found_runs(opened))))
         changes = "\n".join(map(str, texts))
         if changes:
             _say(console, changes, "yellow")
@@ -124,6 +125,7 @@ def run(
     """
     # `plan` needs none of it.
     with without_collections():
+        from music_rllib.experiment.record import keep_record
         from music_rllib.sweep.driver_lock import alone, driving
         from music_rllib.sweep.execution import compute_and_report, open_tracker
 
@@ -131,7 +133,7 @@ def run(
     warn = partial(_say, console, style="yellow")
     try:
         opened, _ = _open(console, config, lenient=retrain_damaged, wait_minutes=wait_minutes)
-        changes = changes_since(opened)
+        changes = _changes(opened)
         if changes is not None and not accept_changes:
             raise BadInputError(str(changes))
         again, kept = decide(
@@ -216,6 +218,14 @@ def _with_environment(console: Console, config: SweepConfig) -> SweepConfig:
     _say(console, f"MLflow: {redact(uri)}, from {VARIABLE} ({how})")
     mlflow = MlflowSettings(**given, tracking_uri=uri)
     return replace(config, mlflow=mlflow, document={**config.document, "mlflow": vars(mlflow)})
+
+
+def _changes(opened: OpenSweep) -> Changes | None:
+    if not opened.recorded:
+        return None
+    from music_rllib.experiment.record import changes_since
+
+    return changes_since(opened)
 
 
 def _check(opened: OpenSweep) -> None:

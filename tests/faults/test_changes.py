@@ -15,9 +15,9 @@ from ray.tune.search import Searcher
 from music_rllib.config.load import load_config
 from music_rllib.config.schema import SweepConfig
 from music_rllib.errors import BadInputError
-from music_rllib.experiment.open_sweep import OpenSweep, open_sweep
+from music_rllib.experiment.open_sweep import OpenSweep, continued_runs_text, open_sweep
 from music_rllib.experiment.plan import Node, continuation_key, make_plan
-from music_rllib.experiment.record import changes_since, continued_runs_text, keep_record
+from music_rllib.experiment.record import changes_since, keep_record
 from music_rllib.experiment.scheduler import Listener
 from music_rllib.store import lease as lease_module
 from music_rllib.store.history import RunResult

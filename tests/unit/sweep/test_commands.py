@@ -30,12 +30,13 @@ from music_rllib.experiment import sweep_files
 from music_rllib.experiment.open_sweep import (
     OpenSweep,
     changed_text,
+    continued_runs_text,
     found_runs,
     open_sweep,
     remove_damaged,
 )
 from music_rllib.experiment.plan import Node, continuation_key, make_plan
-from music_rllib.experiment.record import changes_since, continued_runs_text, keep_record
+from music_rllib.experiment.record import changes_since, keep_record
 from music_rllib.experiment.scheduler import Status
 from music_rllib.experiment.sweep_files import as_json
 from music_rllib.names import ShortLabels
