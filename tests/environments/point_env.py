@@ -71,27 +71,6 @@ class Point(gym.Env[dict[str, Array], Array]):
         }
 
 
-class Meeting(Point):
-    """Write the node's name to `folder`, and wait until another node has done so.
-
-    Args:
-        folder: shared folder.
-    """
-
-    def __init__(self, folder: str) -> None:
-        import ray
-
-        super().__init__()
-        if not ray.is_initialized():
-            return  # in the driver
-        Path(folder, ray.get_runtime_context().get_node_id()).touch()
-        for _ in range(1500):
-            if len(list(Path(folder).iterdir())) > 1:
-                return
-            time.sleep(0.1)
-        raise RuntimeError("no run on another node has come")
-
-
 class Hanging(Point):
     """Never return from a step.
 
@@ -131,6 +110,28 @@ class Paced(Point):
         if self._steps >= self._after and not self._fast.exists():
             time.sleep(self._seconds)
         return super().step(action)
+
+
+class Meeting(Paced):
+    """Write the node's name to `folder`, and wait until another node has done so.
+
+    Args:
+        folder: shared folder.
+        fast: path of the file until which steps are slow.
+    """
+
+    def __init__(self, folder: str, fast: str) -> None:
+        import ray
+
+        super().__init__(fast, seconds=0.02)
+        if not ray.is_initialized():
+            return  # in the driver
+        Path(folder, ray.get_runtime_context().get_node_id()).touch()
+        for _ in range(1500):
+            if len(list(Path(folder).iterdir())) > 1:
+                return
+            time.sleep(0.1)
+        raise RuntimeError("no run on another node has come")
 
 
 class HandOver(Point):

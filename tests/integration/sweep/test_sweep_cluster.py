@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -22,12 +23,11 @@ import requests
 import yaml
 
 from music_rllib.runtime.quiet import LOCAL_RAY_BEYOND_LOOPBACK
+from tests.integration.conftest import ENVIRONMENTS, REPOSITORY, rows
 from tests.ports import free_port
 
 pytestmark = pytest.mark.integration
 
-REPOSITORY = Path(__file__).parents[3]
-ENVIRONMENTS = Path(__file__).parents[2] / "environments"
 BIN = Path(sys.executable).parent
 
 
@@ -97,7 +97,10 @@ def head_node(home: Path, cpus: int, workers: Sequence[int] = ()) -> Iterator[He
     head = Head(address, url, folder, environment, nodes[0])
     try:
         wait_for_jobs(head)
-        nodes += [ray_start(folder, environment, n, f"--address={address}") for n in workers]
+        for number, more in enumerate(workers):
+            # With one folder for both, a node deletes a job's files that the other one uses.
+            options = [f"--address={address}", f"--temp-dir={folder / f'ray{number}'}"]
+            nodes.append(ray_start(folder, environment, more, *options))
         wait_for_nodes(head, len(nodes))
         yield head
     finally:
@@ -156,45 +159,29 @@ def small(document: dict[str, Any]) -> dict[str, Any]:
     return document
 
 
-def run_sweep(
+def start_sweep(
     head: Head, document: dict[str, Any], folder: Path, command: str = "run"
-) -> subprocess.CompletedProcess[str]:
+) -> subprocess.Popen[str]:
     """With `RAY_ADDRESS`, from a folder of the user's, which has the environment's module."""
     (folder / "sweep.yaml").write_text(yaml.safe_dump(document, sort_keys=False))
     shutil.copy(ENVIRONMENTS / "point_env.py", folder)
-    return subprocess.run(
+    return subprocess.Popen(
         [sys.executable, "-m", "music_rllib.sweep", command, "sweep.yaml"],
         cwd=folder,
         env=head.environment | {"RAY_ADDRESS": head.address, "PYTHONPATH": str(REPOSITORY)},
-        capture_output=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
         text=True,
-        timeout=280,
-        check=False,
     )
 
 
-def test_two_runs_at_a_time_on_two_nodes(
-    head: Head, sweep_document: dict[str, Any], tmp_path: Path
-) -> None:
-    """Each run waits for the other one, and neither node has room for more than one."""
-    document = small(sweep_document)
-    document["seeds"] = [0, 1]
-    document["resources"] = {"memory_per_run": 0.05}  # so that Ray is asked before it begins, too
-    folder = tmp_path / "meeting"
-    folder.mkdir()
-    document["environments"]["Point"] |= {
-        "env_id": "point_env:Meeting-v0",
-        "env_kwargs": {"folder": str(folder)},
-    }
-    done = run_sweep(head, document, tmp_path)
-    assert (done.returncode, done.stderr) == (0, ""), done.stdout
-    assert len(list(folder.iterdir())) == 2
-    assert len(list((tmp_path / "results" / "nodes").iterdir())) == 2
-    document["seeds"] = [0, 1, 2, 3]
-    planned = run_sweep(head, document, tmp_path, "plan")
-    assert f"Cluster {head.address}: 2 nodes hold 2 runs at a time. The 2 runs left take " in (
-        planned.stdout
-    )
+def run_sweep(
+    head: Head, document: dict[str, Any], folder: Path, command: str = "run"
+) -> subprocess.CompletedProcess[str]:
+    """`start_sweep` to its end."""
+    with start_sweep(head, document, folder, command) as process:
+        output, errors = process.communicate(timeout=280)
+    return subprocess.CompletedProcess(process.args, process.returncode, output, errors)
 
 
 def test_more_cpus_than_any_node_has(
@@ -361,45 +348,71 @@ class Site:
         wait_for_newer(self.storage / "work", "")
         assert self.jobs.call(head, "stop", "one").returncode == 0
         assert request(head, "/api/jobs/one")["status"] == "STOPPED"
-        log: str = self.jobs.call(head, "logs", "one").stdout
+        log = str(request(head, "/api/jobs/one/logs")["logs"])
         assert "stopping, this takes a few seconds" in log
         assert "Stopped. Finished runs and the last checkpoints are kept" in log
         return log
 
-    def finish(self, head: Any) -> str:
+    def finish(self, head: Any, runs: int = 1) -> str:
         """A job that goes on to the end; its output."""
         self.fast.touch()
         done = self.jobs.submit(head, "last")
         assert done.returncode == 0, done.stdout + done.stderr
-        assert "continues at" in done.stdout
-        assert "] seed0: finished" in done.stdout
+        for seed in range(runs):
+            assert f"] seed{seed}: continues at" in done.stdout
+            assert f"] seed{seed}: finished" in done.stdout
         assert f"using {self.storage}. Give an absolute path" in done.stdout
         assert request(head, "/api/jobs/last")["driver_exit_code"] == 0
-        assert len(list((self.storage / "nodes").iterdir())) == 1
+        assert len(list((self.storage / "nodes").iterdir())) == runs
         return str(done.stdout)
 
 
-def site_at(home: Path, sweep_document: dict[str, Any], tmp_path: Path, **tac: Any) -> Site:
-    """With `home` as its home, and changed settings of TAC."""
-    document = small(sweep_document)
-    document["defaults"]["tac"] |= tac
-    document["defaults"] |= {"env_steps": 10_000, "evaluation": {"interval": 400, "episodes": 1}}
-    fast = tmp_path / "fast"
+def paced(document: dict[str, Any], fast: Path) -> dict[str, Any]:
+    """A sweep whose runs are slow until the file `fast` exists."""
+    small(document)["defaults"] |= {
+        "env_steps": 10_000,
+        "evaluation": {"interval": 400, "episodes": 1},
+    }
     document["environments"]["Point"] |= {
         "env_id": "point_env:Paced-v0",
         "env_kwargs": {"fast": str(fast)},
     }
-    return Site(Jobs(tmp_path / "checkout", document), fast, home)
+    return document
 
 
 @pytest.mark.timeout(900)
-def test_job_is_stopped_and_a_later_one_goes_on(
+def test_two_runs_on_two_nodes_are_stopped_and_a_job_finishes_them(
     head: Head, sweep_document: dict[str, Any], tmp_path: Path
 ) -> None:
+    """Each run waits for the other one, and neither node has room for more than one."""
+    met, fast = tmp_path / "met", tmp_path / "fast"
+    met.mkdir()
+    document = paced(sweep_document, fast)
+    document["environments"]["Point"] |= {
+        "env_id": "point_env:Meeting-v0",
+        "env_kwargs": {"folder": str(met), "fast": str(fast)},
+    }
+    document["seeds"] = [0, 1]
+    document["resources"] = {"memory_per_run": 0.05}  # so that Ray is asked before it begins, too
+    document["defaults"] |= {"env_steps": 2_000, "evaluation": {"interval": 200, "episodes": 1}}
     # Updates would be compiled anew in the job's copy of the package.
-    site = site_at(head.home, sweep_document, tmp_path, random_steps=9_999)
-    site.stop_one(head)
-    site.finish(head)
+    document["defaults"]["tac"]["random_steps"] = 1_999
+    site = Site(Jobs(tmp_path / "checkout", document), fast, head.home)
+    document["storage"] = str(site.storage)
+    with start_sweep(head, document, tmp_path) as process:
+        wait_for_newer(site.storage / "work", "")
+        process.send_signal(signal.SIGINT)
+        output, errors = process.communicate(timeout=120)
+    assert (process.returncode, errors) == (130, "")
+    assert "continue with: python -m music_rllib.sweep run sweep.yaml" in output
+    assert [row[-1] for row in rows(output)] == ["interrupted", "interrupted"]
+    assert len(list(met.iterdir())) == 2
+    site.finish(head, runs=2)
+    document["seeds"] = [0, 1, 2, 3]
+    planned = run_sweep(head, document, tmp_path, "plan")
+    assert f"Cluster {head.address}: 2 nodes hold 2 runs at a time. The 2 runs left take " in (
+        planned.stdout
+    )
 
 
 @pytest.mark.thorough
@@ -410,8 +423,10 @@ def test_job_is_stopped_then_outlives_its_cluster(
     """Stopped in good order; resumed, and its head killed; resumed on a new cluster to its end."""
     home = tmp_path / "home"
     home.mkdir()
-    site = site_at(home, sweep_document, tmp_path)
-    jobs, work = site.jobs, site.storage / "work"
+    fast = tmp_path / "fast"
+    jobs = Jobs(tmp_path / "checkout", paced(sweep_document, fast))
+    site = Site(jobs, fast, home)
+    work = site.storage / "work"
     with head_node(site.home, 1) as head:
         stranger = jobs.submit(head, "stranger", token="another-token-of-some-length-0123456789")
         assert stranger.returncode == 1
