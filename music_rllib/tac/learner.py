@@ -217,7 +217,7 @@ class TACLearner(TorchLearner):
         if (some := self._settings.target_critics) is not None:
             size = (updates, self._settings.critic_count)
             order = torch.rand(size, generator=self._generator, device=self._device).argsort(1)
-            policy["target_critics"] = order[:, :some].flatten()
+            policy["target_critics"] = order[:, :some].contiguous().flatten()
         trajectories, first = columns.get(ESTIMATOR_MODULE), self._grad_updates == 0
         drawn = self._music.draw(updates, rows, trajectories, self._generator, first=first)
         return Minibatches(columns, drawn)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Group, RenderableType
+from rich.table import Table
 from rich.text import Text
 
 from music_rllib import names
@@ -15,11 +17,13 @@ from music_rllib.config.load import warnings_of
 from music_rllib.config.problems import shown
 from music_rllib.config.schema import Source, Stage, SweepConfig
 from music_rllib.config.search import SearchSettings
+from music_rllib.config.tac_settings import MatchedAlpha, NormalisedAlpha, alpha_at, setting_text
 from music_rllib.envs.tasks import Task
 from music_rllib.experiment.open_sweep import OpenSweep, plan_node
-from music_rllib.experiment.plan import Plan, shared_runs, short
+from music_rllib.experiment.plan import Node, Plan, shared_runs, short
 from music_rllib.names import in_runs
 from music_rllib.redaction import redact
+from music_rllib.schedules import Linear, Measured, Piecewise, value_at
 
 if TYPE_CHECKING:
     from music_rllib.runtime.ray_cluster import Capacity
@@ -44,7 +48,10 @@ def plan_view(config: SweepConfig, plan: Plan, finished: Collection[str]) -> Ren
         lines[-1] += f" Searches: up to {runs} more runs and {steps:,} more env steps"
         fresh = any(one.search and one.search.final and one.source for one in config.stages)
         lines[-1] += ", without the source runs of fresh seeds." if fresh else "."
-    return Group(table, *map(Text, lines))
+    parts: list[RenderableType] = [table, *map(Text, lines)]
+    if rows := alpha_rows(plan):
+        parts.append(_alpha_table(rows))
+    return Group(*parts)
 
 
 def _searched_runs(config: SweepConfig) -> dict[str, list[RunGroup]]:
@@ -175,6 +182,7 @@ def plan_answer(opened: OpenSweep, changes: str) -> dict[str, Any]:
         "nodes": nodes,
         "searches": searches,
         "remarks": [*warnings_of(config), *shared_runs(plan)],
+        "alpha": alpha_rows(plan),
         "changes": changes or None,
     }
 
@@ -211,3 +219,61 @@ def cluster_text(address: str, answer: Mapping[str, Any]) -> str:
     if seconds is None:
         return f"{text}. 'plan --measure' estimates the duration of the {left} left."
     return f"{text}. The {left} left take about {clock(seconds)}, at the speed of finished runs."
+
+
+# -- alpha ----------------------------------------------------------------------------------------
+
+
+def alpha_rows(plan: Plan) -> list[dict[str, Any]]:
+    """Alpha at the start and at the end of a run, for each stage, scaled alpha and q.
+
+    A plain alpha has no row because it is as given, a learned one because it is not known yet.
+    """
+    scaled = [
+        node
+        for node in plan.nodes
+        if isinstance(node.run.tac.alpha, MatchedAlpha | NormalisedAlpha)
+    ]
+    # Only the joint entropy's scale depends on the number of dimensions of an action.
+    joint = {n.run.task.name: n.run.task for n in scaled if n.run.tac.entropy_form == "joint"}
+    dimensions = {name: _action_dimensions(task) for name, task in joint.items()}
+    rows = (_alpha_row(node, dimensions.get(node.run.task.name, 1)) for node in scaled)
+    unique = {repr(row): row for row in rows}.values()
+    return sorted(unique, key=lambda row: (row["stage"], row["alpha"], row["q_at_start"]))
+
+
+def _alpha_row(node: Node, action_dimensions: int) -> dict[str, Any]:
+    tac, budget = node.run.tac, node.run.env_steps
+    q_at_start = value_at(tac.entropic_index, 0, budget)
+    q_at_end = _final_q(tac.entropic_index, budget)
+    return {
+        "stage": node.stage,
+        "alpha": setting_text(tac.alpha),
+        "q": setting_text(tac.entropic_index),
+        "q_at_start": q_at_start,
+        "at_start": alpha_at(tac, q_at_start, 0, budget, action_dimensions),
+        "at_end": alpha_at(tac, q_at_end, budget, budget, action_dimensions),
+    }
+
+
+def _final_q(q: float | Linear | Piecewise | Measured, budget: int) -> float:
+    """The q at the end of a run; one that follows a measurement ends at its last point."""
+    if isinstance(q, Measured):
+        return q.points[-1 if q.follows == "success_rate" else 0][1]
+    return value_at(q, budget, budget)
+
+
+def _action_dimensions(task: Task) -> int:
+    from music_rllib.envs.make import make_env  # few plans need an environment
+
+    with closing(make_env(task.env_id, **task.env_kwargs)) as env:
+        return int(env.action_space.shape[0])  # type: ignore[index]
+
+
+def _alpha_table(rows: Iterable[dict[str, Any]]) -> Table:
+    heads = ("stage", "alpha", "q", "α at the start", "at the end")
+    table = new_table("α for each q", heads, left=heads[:2])
+    for row in rows:
+        numbers = (f"{row['at_start']:.4g}", f"{row['at_end']:.4g}")
+        table.add_row(row["stage"], row["alpha"], row["q"], *numbers)
+    return table

@@ -1,6 +1,7 @@
 """What a person sees: the plan, progress on a terminal and without one, the results."""
 
 import io
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,11 +17,12 @@ from music_rllib.config.schema import SweepConfig
 from music_rllib.config.tac_settings import LearnedAlpha, setting_text
 from music_rllib.experiment.plan import Plan, make_plan
 from music_rllib.experiment.scheduler import Failure, Scheduler
+from music_rllib.report.figures.plots import color_of
 from music_rllib.schedules import Linear, Piecewise
 from music_rllib.store.history import Report, RunResult
 from music_rllib.store.storage import resolve_storage, sweep_folder
 from music_rllib.sweep.listeners.screen import Display
-from music_rllib.sweep.views.plan import plan_view
+from music_rllib.sweep.views.plan import alpha_rows, plan_view
 from music_rllib.sweep.views.results import results_table
 
 DOCUMENT: dict[str, Any] = {
@@ -93,6 +95,47 @@ def test_settings_that_vary_together_are_shown_together(tmp_path: Path) -> None:
     labels = {node.label for node in plan.nodes if node.run.seed == 0}
     point = "tac.entropic_index={},tac.alpha={}".format
     assert {label.split("/")[-2] for label in labels} == {point(1, 0.15), point(1.5, 0.05)}
+
+
+def test_the_plan_shows_what_a_control_makes_of_alpha_at_each_q(tmp_path: Path) -> None:
+    alpha = {"value": 0.05, "matched_width": 0.1}
+    ramp = {"schedule": "linear", "start": 1.0, "end": 2.0}
+    stages = [
+        {
+            "name": "fixed",
+            "variant": "tac",
+            "tac": {"alpha": alpha},
+            "grid": {"tac.entropic_index": [2.0, 1.0]},
+        },
+        {
+            "name": "joint",
+            "variant": "tac",
+            "tac": {"alpha": alpha, "entropic_index": ramp, "entropy_form": "joint"},
+        },
+        {"name": "plain", "variant": "tac", "grid": {"tac.alpha": [0.05, 0.1]}},
+    ]
+    rows = alpha_rows(make_plan(loaded(tmp_path, stages=stages)))
+    # G = q^(-1/2) (sqrt(2 pi) sigma)^(1-q) at q = 2, and of four dimensions its fourth power.
+    pressure = 2**-0.5 / ((2 * math.pi) ** 0.5 * 0.1)
+    assert [(row["stage"], row["q"]) for row in rows] == [
+        ("fixed", "1"),
+        ("fixed", "2"),
+        ("joint", "1 to 2"),
+    ]
+    assert [row["at_start"] for row in rows] == pytest.approx([0.05, 0.05 / pressure, 0.05])
+    assert rows[2]["at_end"] == pytest.approx(0.05 / pressure**4)
+    config = loaded(tmp_path, stages=stages)
+    assert "0.05 matched at 0.1" in shown(plan_view(config, make_plan(config), ()))
+
+
+def test_alpha_of_a_q_that_follows_a_measurement_ends_at_its_last_point(tmp_path: Path) -> None:
+    q = {"follows": "success_rate", "points": [[0.2, 2.0], [0.9, 1.0]], "monotone": True}
+    alpha = {"value": 0.05, "matched_width": 0.1}
+    stage = {"name": "her", "variant": "tac", "grid": {"tac.entropic_index": [q, 1.0]}}
+    plan = make_plan(loaded(tmp_path, stages=[stage | {"tac": {"alpha": alpha}}]))
+    row = alpha_rows(plan)[1]
+    assert (row["q"], row["q_at_start"], row["at_end"]) == ("2 to 1 by success rate", 2.0, 0.05)
+    assert color_of(row["q"]) == color_of("1"), "it has that of its last value"
 
 
 def test_results_have_a_row_per_run_whatever_became_of_it(plan: Plan) -> None:
