@@ -26,6 +26,8 @@ from typing import Any
 import psutil
 
 BIN = Path(sys.executable).parent
+ROOT = Path(__file__).resolve().parents[2]
+"""The checkout with the installed package, which a machine sees even if it is below `/tmp`."""
 DELAY_SECONDS, LOSS = 0.1, 0.01
 """Of a slow wire, for each frame in either direction."""
 
@@ -34,7 +36,10 @@ _UNSHARE = ["unshare", "--net", "--mount", "--pid", "--uts", "--fork", "--kill-c
 _INIT = """
 set -e
 mount -o remount,bind,ro /
+mount --bind {root} /mnt
 mount -t tmpfs tmpfs /tmp
+mkdir -p {root}
+mount --bind /mnt {root}
 mount -t tmpfs tmpfs /dev/shm
 mkdir /tmp/home
 hostname {name}
@@ -120,7 +125,7 @@ class Host:
         self._started: list[subprocess.Popen[str]] = []
         self.wire = os.open("/dev/net/tun", os.O_RDWR)
         self._life = subprocess.Popen(
-            [*_UNSHARE, "--mount-proc", "sh", "-c", _INIT.format(name=name)],
+            [*_UNSHARE, "--mount-proc", "sh", "-c", _INIT.format(name=name, root=ROOT)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
