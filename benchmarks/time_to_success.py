@@ -1,7 +1,7 @@
 """CPU seconds of training until a policy succeeds in 90% of FetchPush's episodes.
 
-`python -m benchmarks.time_to_success NAME SEED SECONDS` is one training of one program. It stops at
-90% of 50 evaluation episodes, which do not count, or after so many CPU seconds.
+`python -m benchmarks.time_to_success NAME SEED SECONDS` trains one program once. It stops when 90%
+of 50 evaluation episodes succeed, or after SECONDS of CPU time. Evaluations are not counted.
 """
 
 from __future__ import annotations
