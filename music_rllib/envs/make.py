@@ -255,17 +255,17 @@ def _play_some(reward: GoalReward, env: Env, first: Any) -> Recording:
 
 def augmentation_of(
     symmetries: Symmetries, used: Collection[Symmetry], layout: ReplayLayout, env: Env,
-    *, reward: GoalReward | None = None, seed: int = 0,
+    *, reward: GoalReward | None = None, goals: bool = True, seed: int = 0,
 ) -> Augmentation:  # fmt: skip
-    """The task's symmetries for a replay; with `reward`, goals have a place and change, too.
+    """The task's symmetries for a replay, checked against `reward`; False if all `goals` are 0.
 
-    Resets `env` if there is a `reward`.
+    Resets `env` if rewards are checked.
 
     Raises:
         ValueError: They do not fit the environment, or change rewards.
     """
-    augmentation = Augmentation(symmetries, used, layout, goals=reward is not None)
-    if reward is None:
+    augmentation = Augmentation(symmetries, used, layout, goals=goals)
+    if reward is None or not goals:
         return augmentation
     start = np.asarray(env.reset(seed=seed)[0]["achieved_goal"], np.float32)
     rows = 256

@@ -29,7 +29,6 @@ from music_rllib.envs.features import beyond_observation
 from music_rllib.envs.make import (
     Env,
     augmentation_of,
-    compute_reward_of,
     goal_reward_of,
     make_env,
     moved_distance_of,
@@ -229,7 +228,7 @@ class Probe:
 
     def _check_symmetries(self, env: Env, seed: int) -> None:
         symmetries = self._task.symmetries
-        reward = compute_reward_of(env) if symmetries.kinds else None
+        reward = self._reward if symmetries.kinds else None
         try:
             augmentation_of(
                 symmetries, symmetries.kinds, self._layout, env, reward=reward, seed=seed

@@ -32,7 +32,6 @@ from ray.rllib.utils.typing import StateDict
 from music_rllib.envs.episodes import Episode
 from music_rllib.envs.make import (
     augmentation_of,
-    compute_reward_of,
     goal_reward_of,
     moved_distance_of,
 )
@@ -90,10 +89,9 @@ class TAC(Algorithm):
             moved_distance = moved_distance_of(runner.env, goal_reward, seed)
         augment = None
         if settings.symmetries:
-            with_goals = self._settings.music.goals == "environment"
             augment = augmentation_of(
                 self.config.task_symmetries, settings.symmetries, runner.layout, runner.env,
-                reward=compute_reward_of(runner.env) if with_goals else None, seed=seed,
+                reward=goal_reward, goals=self._settings.music.goals == "environment", seed=seed,
             )  # fmt: skip
         return TrajectoryReplay(
             runner.layout,
