@@ -72,9 +72,11 @@ def _legend(sweep: Sweep) -> dict[Condition, tuple[str, Style]]:
 def _entry(stage: StageRuns, condition: Condition, style: Style) -> tuple[str, Style]:
     if not stage.has_task_reward:
         return PRETRAINING
-    return (
-        SCRATCH if stage.variant == "tac" else (f"MUSIC-r, q = {condition.entropic_index}", style)
-    )
+    from_scratch = stage.variant == "tac"
+    if from_scratch and len({other.entropic_index for other in stage.conditions}) == 1:
+        return SCRATCH
+    reward = "HER alone" if from_scratch else "MUSIC-r"
+    return f"{reward}, q = {condition.entropic_index}", style
 
 
 def _subplot(

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from docs.result_pages.summary import between_q, complete_studies
+from docs.result_pages.summary import STUDIES, between_q, complete_studies
 from music_rllib.results.answer import p_in_words
 from music_rllib.results.claims import Claim, Contrast, Verdict, contrast, decided
 from music_rllib.results.data import Sweep
@@ -35,7 +35,8 @@ def _stability(sweep: Sweep, planned: Sequence[Claim], at: int) -> str:
         for seed in range(seeds)
     ]
     text = (
-        f"{claim.first} against {claim.second} on {claim.task}: {claim.verdict} in "
+        f"{claim.first} against {claim.second} on {claim.task} "
+        f"({STUDIES[sweep.name]}): {claim.verdict} in "
         f"{verdicts.count(claim.verdict)} of {seeds} cases"
     )
     if cut := MORE.get(sweep.name, 0):

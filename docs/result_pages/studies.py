@@ -52,7 +52,9 @@ def answer_text(sweep: Sweep) -> Iterator[str]:
 
 def outcomes_table(sweep: Sweep, *stages: str) -> Iterator[str]:
     """One column per condition: the planned metric, and below it other numbers."""
-    rates = (f"steps after pretraining to {percent(rate)}: median [95% CI]" for rate in THRESHOLDS)
+    pretrained = any(names.TAG_SOURCE_NODE in run.tags for run in sweep.runs)
+    steps = "steps after pretraining" if pretrained else "steps"
+    rates = (f"{steps} to {percent(rate)}: median [95% CI]" for rate in THRESHOLDS)
     columns = [
         [
             "",

@@ -15,7 +15,15 @@ from music_rllib.results.claims import Claim, Verdict, claims_of, exploratory
 from music_rllib.results.data import Sweep
 from music_rllib.results.study import Study, study_of
 
-STUDIES = ("claims-push", "claims-pick-and-place", "claims-slide")
+JOINT = "joint entropy, HER alone"
+MUSIC = "per-dimension entropy, MUSIC-r"
+STUDIES = {
+    "joint-her": JOINT,
+    "claims-push": MUSIC,
+    "claims-pick-and-place": MUSIC,
+    "claims-slide": MUSIC,
+}
+"""Setting of each study; studies of one setting share a sentence."""
 PAPER = {
     ("FetchPush", "q = 1.5", "q = 1"): "Figure 4: faster",
     ("FetchPickAndPlace", "q = 1.5", "q = 1"): "Figure 5: better",
@@ -48,23 +56,33 @@ def between_q(claims: Sequence[Claim]) -> list[Claim]:
 
 
 def headline() -> str:
-    """One sentence: the effect of q on each task, by the verdicts on the mean action."""
-    claims = [c for _, study in complete_studies() for c in between_q(study.planned)]
+    """A sentence per setting: the effect of q on each task, by the verdicts on the mean action."""
+    settings: dict[str, list[Claim]] = {}
+    for sweep, study in complete_studies():
+        settings.setdefault(STUDIES[sweep.name], []).extend(between_q(study.planned))
+    sentences = (f"{setting}: {_effects(claims)}." for setting, claims in settings.items())
+    return f"**{' '.join(text[0].upper() + text[1:] for text in sentences)}**"
+
+
+def _effects(claims: Sequence[Claim]) -> str:
+    """The effect of q on each task."""
+    tasks = dict.fromkeys(claim.task for claim in claims)
     better = [pair for c in claims if (pair := winner_and_loser(c)) and pair[0] == "q = 1.5"]
     parts = [f"q = 1.5 needs fewer steps than {loser} on {task}" for _, loser, task in better]
-    parts = parts or ["q = 1.5 beats neither q = 1 nor q = 2 on any task here"]
+    where = "any task here" if len(tasks) > 1 else next(iter(tasks))
+    parts = parts or [f"q = 1.5 beats neither q = 1 nor q = 2 on {where}"]
     parts += [
         f"{pair[1]} needs more steps than {pair[0]} on {pair[2]}"
         for c in claims
         if (pair := winner_and_loser(c)) and pair not in better
     ]
-    for task in dict.fromkeys(claim.task for claim in claims):
+    for task in tasks:
         verdicts = {claim.verdict for claim in claims if claim.task == task}
         if verdicts == {Verdict.UNDECIDED}:
             parts.append(f"{task} is open")
         elif Verdict.EQUIVALENT in verdicts:
             parts.append(_alike([claim for claim in claims if claim.task == task]))
-    return f"**{'; '.join(parts)}.**"
+    return "; ".join(parts)
 
 
 def winner_and_loser(claim: Claim) -> tuple[str, str, str] | None:
@@ -94,7 +112,9 @@ def sampled_sentence() -> str:
             gap = claim.contrast.difference
             if gap.lower > 0 or gap.upper < 0:
                 side = "above" if gap.value > 0 else "below"
-                where.setdefault((claim.first, side, claim.second), []).append(claim.task)
+                where.setdefault((claim.first, side, claim.second), []).append(
+                    f"{claim.task} ({STUDIES[sweep.name]})"
+                )
     parts = [
         f"{first} is {side} {second} on {' and '.join(tasks)}"
         for (first, side, second), tasks in where.items()
@@ -107,21 +127,31 @@ def sampled_sentence() -> str:
 
 def summary_table() -> Iterator[str]:
     """One row per task and comparison: verdicts on the mean action and on the sampled policy."""
-    yield row("task", "comparison", "the paper", "mean action", "sampled policy", "seeds")
-    yield rule(6)
+    columns = (
+        "task",
+        "setting",
+        "comparison",
+        "the paper",
+        "mean action",
+        "sampled policy",
+        "seeds",
+    )
+    yield row(*columns)
+    yield rule(len(columns))
     for sweep, study in complete_studies():
+        setting = STUDIES[sweep.name]
         for claim, other in zip(study.planned, sampled(sweep, study), strict=True):
             paper = PAPER.get((claim.task, claim.first, claim.second), "Figure 7: worse")
             comparison = f"{claim.first} against {claim.second}"
             if claim.first.startswith(BETWEEN_STAGES):
                 paper, comparison = "", "MUSIC-r, q = 1, against HER alone, pretraining not counted"
             cells = (verdict_cell(claim), verdict_cell(other), claim.contrast.seeds[0])
-            yield row(claim.task, comparison, paper, *cells)
+            yield row(claim.task, setting, comparison, paper, *cells)
         for found in equal_totals(sweep, study):
             mean, other = (one.claim for one in found)
             comparison = f"the same at {found[0].total:,.0f} steps in all, pretraining counted"
             cells = (verdict_cell(mean), verdict_cell(other), mean.contrast.seeds[0])
-            yield row(mean.task, comparison, "", *cells)
+            yield row(mean.task, setting, comparison, "", *cells)
 
 
 def equal_totals(sweep: Sweep, study: Study) -> Iterator[tuple[AtEqualTotal, AtEqualTotal]]:

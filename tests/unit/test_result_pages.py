@@ -68,7 +68,7 @@ def test_pretraining_counts_towards_an_equal_total() -> None:
     [
         (
             (Verdict.UNDECIDED, Verdict.UNDECIDED, Verdict.WORSE),
-            "q = 1.5 beats neither q = 1 nor q = 2 on any task here; "
+            "q = 1.5 beats neither q = 1 nor q = 2 on FetchPush; "
             "q = 2 needs more steps than q = 1 on FetchPush",
         ),
         (
@@ -77,7 +77,7 @@ def test_pretraining_counts_towards_an_equal_total() -> None:
         ),
         (
             (Verdict.UNDECIDED, Verdict.UNDECIDED, Verdict.UNDECIDED),
-            "q = 1.5 beats neither q = 1 nor q = 2 on any task here; FetchPush is open",
+            "q = 1.5 beats neither q = 1 nor q = 2 on FetchPush; FetchPush is open",
         ),
     ],
 )
@@ -94,5 +94,7 @@ def test_the_first_sentence_follows_the_verdicts(
         for (first, second), verdict in zip(pairs, verdicts, strict=True)
     )
     study = replace(study_of(runs), planned=claims)
-    monkeypatch.setattr(summary, "complete_studies", lambda: [(runs, study)])
-    assert summary.headline() == f"**{sentence}.**"
+    monkeypatch.setattr(
+        summary, "complete_studies", lambda: [(replace(runs, name="joint-her"), study)]
+    )
+    assert summary.headline() == f"**Joint entropy, HER alone: {sentence}.**"

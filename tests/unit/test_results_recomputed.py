@@ -1,0 +1,292 @@
+"""Each number of the results page follows from the exported runs by plain pandas and scipy.
+
+Nothing here is computed by the package: the definitions are those of docs/comparing_q.md and
+docs/reports.md, written down a second time.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from numpy.typing import NDArray
+from scipy import stats
+
+DOCS = Path(__file__).parents[2] / "docs"
+PAGE = (DOCS / "results.md").read_text("utf-8")
+MARGIN = 0.05
+MEAN, SAMPLED = "evaluation/success_rate", "training/success_rate"
+ENTROPIES = ("entropy/shannon", "entropy/tsallis")
+JOINT, MUSIC = "joint entropy, HER alone", "per-dimension entropy, MUSIC-r"
+STUDIES = {  # export and compared stage
+    ("FetchPush", MUSIC): ("claims-push", "music-r"),
+    ("FetchPickAndPlace", MUSIC): ("claims-pick-and-place", "music-r"),
+    ("FetchSlide", MUSIC): ("claims-slide", "music-r"),
+}
+BETWEEN_Q = (("1.5", "1"), ("2", "1.5"), ("2", "1"))
+KINDS = ("p", "tost")
+Claim = dict[str, Any]
+Array = NDArray[np.float64]
+
+
+@cache
+def runs(study: str, stage: str) -> pd.DataFrame:
+    """The runs of a stage."""
+    table = pd.read_parquet(DOCS / "results/data" / study / "runs.parquet")
+    names = {"tag.entropic_index": "q", "tag.seed": "seed", "param.env_steps": "budget"}
+    names |= {"tag.source_node": "source", "tag.node_key": "key", "tag.alpha": "alpha"}
+    own = table[table["tag.stage"] == stage].rename(columns=names)
+    assert len(own)
+    assert (own.status == "FINISHED").all()
+    return own.astype({"budget": int, "seed": int}).sort_values("seed")
+
+
+@cache
+def metrics(study: str) -> pd.DataFrame:
+    path = DOCS / "results/data" / study / "metrics.parquet"
+    table = pd.read_parquet(path, filters=[("metric", "in", [MEAN, SAMPLED, *ENTROPIES])])
+    return table.dropna().set_index(["run", "metric"]).sort_index()
+
+
+def curve(study: str, run: int, metric: str) -> tuple[Array, Array]:
+    points = metrics(study).loc[(run, metric)].sort_values("env_steps")
+    return points.env_steps.to_numpy(float), points.value.to_numpy()
+
+
+def area(steps: Array, values: Array, budget: float) -> float:
+    at = np.union1d(steps[(steps > 0) & (steps < budget)], [0, budget])
+    return float(np.trapezoid(np.interp(at, steps, values), at)) / budget
+
+
+@cache
+def areas(study: str, stage: str, q: str, metric: str) -> pd.Series:
+    """The area of each seed, averaged over the values of alpha."""
+    own = runs(study, stage).query("q == @q")
+    values = [area(*curve(study, run, metric), own.budget.min()) for run in own.run]
+    return pd.Series(values, own.seed).groupby(level=0).mean()
+
+
+def areas_of_all_steps(study: str, stage: str, metric: str, total: int) -> pd.Series:
+    """The area of each seed at q = 1 over `total` steps, those of the pretraining first."""
+    own = runs(study, stage).query("q == '1'")
+    values = []
+    for run, source in zip(own.run, own.source, strict=True):
+        steps, rates = curve(study, run, metric)
+        if pd.notna(source):
+            (before,) = runs(study, "pretrain").query("key == @source").itertuples()
+            first, early = curve(study, before.run, metric)
+            steps = np.concatenate([first, steps + before.budget])
+            rates = np.concatenate([early, rates])
+        values.append(area(steps, rates, total))
+    return pd.Series(values, own.seed)
+
+
+def compared(x: pd.Series, y: pd.Series) -> Claim:
+    """Paired t-test and two one-sided tests of two conditions."""
+    assert list(x.index) == list(y.index)
+    gap = (x - y).to_numpy()
+    mean, error, freedom = gap.mean(), stats.sem(gap), len(gap) - 1
+    beyond = stats.ttest_1samp(gap, -MARGIN, alternative="greater").pvalue
+    within = stats.ttest_1samp(gap, MARGIN, alternative="less").pvalue
+    away = np.abs(gap - np.median(gap))
+    far = np.sum(away > max(5 * 1.4826 * np.median(away), MARGIN)) if len(gap) >= 16 else 0
+    return {
+        "difference": mean,
+        "p": stats.ttest_1samp(gap, 0).pvalue,
+        "tost": max(beyond, within),
+        "95": stats.t.interval(0.95, freedom, mean, error),
+        "90": stats.t.interval(0.90, freedom, mean, error),
+        "seeds": len(gap),
+        "collapses": stats.beta.ppf(0.8, far + 1, len(gap) - far),
+    }
+
+
+def decided(family: list[Claim], dropped: int = 0) -> list[Claim]:
+    """Holm's method with Shaffer's multiplier: the comparisons of which a test is left."""
+    tests = sorted((claim[kind], i, kind) for i, claim in enumerate(family) for kind in KINDS)
+    left, highest = [set(KINDS) for _ in family], 0.0
+    for p, i, kind in tests:
+        highest = max(highest, min(1.0, p * (dropped + sum(map(bool, left)))))
+        family[i]["adjusted " + kind] = highest
+        left[i].discard(kind)
+    for claim in family:
+        side = "superior" if claim["difference"] > 0 else "worse"
+        claim["verdict"] = side if claim["adjusted p"] < 0.05 else "undecided"
+        if claim["adjusted tost"] < 0.05:
+            claim["verdict"] = "equivalent within 0.05"
+    return family
+
+
+@cache
+def planned(study: str, stage: str, metric: str = MEAN) -> list[Claim]:
+    """The planned comparisons of a study in their order."""
+    claims = [
+        compared(areas(study, stage, first, metric), areas(study, stage, second, metric))
+        for first, second in BETWEEN_Q
+    ]
+    if study == "claims-pick-and-place":
+        claims.append(compared(areas(study, stage, "1", metric), areas(study, "her", "1", metric)))
+    return decided(claims)
+
+
+def in_words(claim: Claim, *, planned: bool) -> str:
+    """`**worse**, -0.05 (95% CI -0.08 to -0.02; p = 0.003, adjusted 0.0089)`."""
+    alike = planned and claim["verdict"] == "equivalent within 0.05"
+    kind, level = ("tost", "90") if alike else ("p", "95")
+    low, high = map(two_decimals, claim[level])
+    interval = f"{two_decimals(claim['difference'], '+')} ({level}% CI {low} to {high}"
+    own = p_text(claim[kind])
+    if not planned:
+        return f"{interval}; unadjusted {own})"
+    adjusted = p_text(claim["adjusted " + kind]).removeprefix("p = ")
+    more = "" if own.endswith(adjusted) else f", adjusted {adjusted}"
+    rate = f"; collapses in up to {100 * claim['collapses']:.0f}% of seeds are not excluded"
+    words = f"**{claim['verdict']}**, {interval}; {'TOST ' * alike}{own}{more})"
+    shown = claim["verdict"] != "undecided" and claim["collapses"] >= 0.05
+    return words + rate if shown else words
+
+
+def two_decimals(value: float, sign: str = "") -> str:
+    return f"{round(value, 2) + 0.0:{sign}.2f}"
+
+
+def p_text(p: float) -> str:
+    return "p < 0.001" if p < 0.001 else f"p = {p:.2g}"
+
+
+def table(after: str) -> list[list[str]]:
+    """The cells of the first table after a text of the page."""
+    lines = PAGE[PAGE.index(after) :].splitlines()
+    start = next(i for i, line in enumerate(lines) if line.startswith("|"))
+    stop = next(i for i in range(start, len(lines)) if not lines[i].startswith("|"))
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[start:stop]]
+
+
+def test_every_row_of_the_summary() -> None:
+    header, _, *rows = table("# Results")
+    assert header[3:] == ["the paper", "mean action", "sampled policy", "seeds"]
+    expected = []
+    for study, stage in STUDIES.values():
+        pairs = zip(planned(study, stage), planned(study, stage, SAMPLED), strict=True)
+        expected += [(mean, in_words(mean, planned=True), other) for mean, other in pairs]
+        if study == "claims-pick-and-place":
+            mean, other = (
+                compared(
+                    areas_of_all_steps(study, stage, metric, 200_000),
+                    areas_of_all_steps(study, "her", metric, 200_000),
+                )
+                for metric in (MEAN, SAMPLED)
+            )
+            expected.append((mean, in_words(mean, planned=False), other))
+    found = [row[4:] for row in rows]
+    assert found == [
+        [text, in_words(other, planned=False), str(mean["seeds"])] for mean, text, other in expected
+    ]
+
+
+def test_the_verdicts_at_several_alphas() -> None:
+    """Of the section on q and entropy, in the order of its list."""
+    pairs = (("1.5", "1"), ("2", "1"), ("2", "1.5"))
+    sides = {q: areas("q-entropy-factorial", "her", q, MEAN) for q in ("1", "1.5", "2")}
+    claims = decided([compared(sides[a], sides[b]) for a, b in pairs])
+    found = re.findall(r"^- q = .* against q = .*: (\*\*.*); 5 seeds(.*)\.$", PAGE, re.MULTILINE)
+    assert ["".join(words) for words in found] == [in_words(one, planned=True) for one in claims]
+
+
+def rate_interval(values: Array, episodes: float) -> tuple[float, float, float]:
+    """Korn and Graubard's interval of a mean rate."""
+    n, mean = len(values), values.mean()
+    if values.std() == 0:
+        trials = n * episodes
+    else:
+        alike = min(mean * (1 - mean) / (values.var(ddof=1) / n), n * episodes)
+        trials = alike * (stats.norm.ppf(0.975) / stats.t.ppf(0.975, n - 1)) ** 2
+    won, lost = mean * trials, (1 - mean) * trials
+    low = stats.beta.ppf(0.025, won, lost + 1) if won > 0 else 0.0
+    return mean, low, stats.beta.ppf(0.975, won + 1, lost) if lost > 0 else 1.0
+
+
+def median_wait(steps: Array, reached: NDArray[np.bool_]) -> str:
+    """Kaplan and Meier's median and the interval from the order of the runs."""
+    data = stats.CensoredData(uncensored=steps[reached], right=steps[~reached])
+    survival = stats.ecdf(data).sf
+    below = np.flatnonzero(survival.probabilities <= 0.5 + 1e-12)
+    median = survival.quantiles[below[0]] if len(below) else np.inf
+    missed = 2 * stats.binom.cdf(np.arange(len(steps)), len(steps), 0.5)
+    order = np.flatnonzero(missed <= 1 - 0.93)[-1]
+    ends = np.sort(steps)[order], np.sort(np.where(reached, steps, np.inf))[-1 - order]
+    words = [f"{x:,.0f}" if np.isfinite(x) else "not reached" for x in (median, *ends)]
+    return f"{words[0]} [{words[1]}, {words[2]}]"
+
+
+def outcomes(study: str, stage: str, q: str) -> list[str]:
+    """A column of a task's table."""
+    own = runs(study, stage).query("q == @q")
+
+    def interval(values: tuple[float, float, float]) -> str:
+        return "{} [{}, {}]".format(*map(two_decimals, values))
+
+    lines = [
+        interval(rate_interval(areas(study, stage, q, metric).to_numpy(), episodes))
+        for metric, episodes in ((MEAN, np.inf), (SAMPLED, np.inf))
+    ]
+    curves = [curve(study, run, MEAN) for run in own.run]
+    finals = rate_interval(np.array([rates[-1] for _, rates in curves]), 50)
+    lines.append("{:.0%} [{:.0%}, {:.0%}]".format(*finals))
+    for threshold in (0.5, 0.85):
+        first = [(np.argmax(rates >= threshold), steps, rates) for steps, rates in curves]
+        reached = [bool(rates[at] >= threshold) for at, _, rates in first]
+        waits = [
+            steps[at if there else -1] for (at, steps, _), there in zip(first, reached, strict=True)
+        ]
+        lines.append(median_wait(np.array(waits), np.array(reached)))
+    for metric in ENTROPIES:
+        last = np.array([curve(study, run, metric)[1][-1] for run in own.run])
+        half = stats.t.ppf(0.975, len(last) - 1) * stats.sem(last)
+        lines.append(interval((last.mean(), last.mean() - half, last.mean() + half)))
+    return [*lines, f"{len(own)} of {len(own)}"]
+
+
+@pytest.mark.parametrize(("study", "stage"), STUDIES.values())
+def test_every_number_of_a_tasks_table(study: str, stage: str) -> None:
+    header, _, *rows = table(f"{study}-all-stages-success")
+    columns = [[line[at] for line in rows] for at in range(1, len(header))]
+    expected = [outcomes(study, stage, q) for q in ("1", "1.5", "2")]
+    if study == "claims-pick-and-place":
+        expected.insert(0, outcomes(study, "her", "1"))
+    assert columns == expected
+
+
+def test_the_verdicts_without_one_seed() -> None:
+    expected = []
+    for (task, setting), (study, stage) in STUDIES.items():
+        for at, claim in enumerate(planned(study, stage)[:3]):
+            if claim["verdict"] == "undecided":
+                continue
+            first, second = BETWEEN_Q[at]
+            same = 0
+            for left_out in sorted(set(runs(study, stage).seed)):
+                sides = [areas(study, stage, q, MEAN).drop(left_out) for q in ("1", "1.5", "2")]
+                by_q = dict(zip(("1", "1.5", "2"), sides, strict=True))
+                again = [compared(by_q[a], by_q[b]) for a, b in BETWEEN_Q]
+                same += decided(again)[at]["verdict"] == claim["verdict"]
+            word = claim["verdict"].removesuffix(" within 0.05")
+            expected.append(
+                f"- q = {first} against q = {second} on {task} ({setting}): {word} in {same} of "
+                f"{claim['seeds']} cases"
+            )
+    assert re.findall(r"^(- q = .* cases)[;.]", PAGE, re.MULTILINE) == expected
+
+
+def test_every_figure_of_the_readme_is_on_the_page() -> None:
+    readme = (DOCS.parent / "README.md").read_text("utf-8").replace("−", "-")
+    section = readme[readme.index("## Results") : readme.index("## In your own")]
+    found = re.findall(r"([+-]\d\.\d\d), (?:95% CI )?(-?\d\.\d\d) to (-?\d\.\d\d)", section)
+    assert len(found) >= 3
+    for value, low, high in found:
+        assert re.search(rf"{re.escape(value)} \(95% CI {low} to {high};", PAGE)
