@@ -26,6 +26,23 @@ Json = Annotated[
     bool, typer.Option("--json", help="One JSON document on stdout, messages on stderr.")
 ]
 
+MAX_TIME = 1_000_000
+
+
+def time_option(text: str | float) -> float:
+    """Parser of an option that is a time: a float accepts NaN, infinity and negative numbers.
+
+    Raises:
+        typer.BadParameter: The value is not a number from 0 to `MAX_TIME`.
+    """
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 <= value <= MAX_TIME:
+        raise typer.BadParameter(f"must be a number from 0 to {MAX_TIME:,}, got {text}")
+    return value
+
 
 def called_as() -> list[str]:
     """The words that start this program, without arguments, for commands shown in messages."""

@@ -31,6 +31,13 @@ _VALUE = rf"""(?:
 _SECRETS = tuple(
     re.compile(pattern, re.IGNORECASE | re.VERBOSE | re.DOTALL)
     for pattern in (
+        # A private key in PEM format, and tokens that are known by their form.
+        r"(?P<name>-----BEGIN\ [A-Z\ ]{0,40}PRIVATE\ KEY(?P<equals>[A-Z\ ]{0,9}-----))"
+        r"(?:(?!-----).){0,20000}",
+        r"""(?-i:(?<![\w\-])(?P<name>(?P<equals>))(?:(?:gh[opsru]|hf|npm)_[A-Za-z0-9]{30,}
+        |github_pat_\w{22,}|glpat-[\w\-]{20,}|xox[a-z]-[\w\-]{10,}|(?:AKIA|ASIA)[A-Z0-9]{16}
+        |AIza[\w\-]{35}|sk-(?:(?:ant|proj|svcacct)-[\w\-]{20,}|[A-Za-z0-9]{32,})
+        |eyJ[\w\-]{8,}\.[\w\-]{8,}\.[\w\-]*)(?![A-Za-z0-9]))""",
         # user:password@ of a URI. A password can contain characters that end the host elsewhere.
         r"""(?P<name>[a-z][a-z0-9+.\-]{0,40}://)
         (?:[^/?\#@\s:'"\[]{0,999}:(?!\d{1,5}(?:[/?\#]|$))[^@\s]{0,999}@
@@ -41,7 +48,14 @@ _SECRETS = tuple(
         r"(?P<name>\bBearer(?P<equals>\s+))[\w.~+/=\-]+",
         # An option of a command: --password x.
         rf"""(?P<name>(?<![\w\-])--?(?:[\w\-]{{0,40}}?(?:{_NAMES})[\w\-]{{0,40}}
-        |(?:[\w\-]{{0,40}}-)?(?:pass|pw|auth))(?P<equals>[ \t]+))(?!-){_VALUE}""",
+        |(?:[\w\-]{{0,40}}-)?(?:pass|pw|auth))(?P<equals>(?:["'],)?[ \t]+))(?!-){_VALUE}""",
+        # Of curl: -u user:password. Two numbers are ids of a user and a group.
+        r"""(?P<name>(?<![\w\-])(?:-u|--(?:proxy-)?user)(?:["'],)?[ \t=]{1,9}["']?
+        (?!\d+:\d+\b)[\w.@+\-]{1,99}(?P<equals>:))(?!//)[^\s'"]+""",
+        # A block of YAML: password: |
+        rf"""(?P<name>(?:{_NAMES}|{_SHORT_NAMES})[\w\-]{{0,40}}["']?[ \t]{{0,9}}
+        (?P<equals>:[ \t]{{1,9}}))[|>][\d+\-]{{0,2}}[ \t]{{0,9}}
+        (?P<indent>\n[ \t]{{1,40}})[^\n]*(?:(?P=indent)[^\n]*)*""",
         # An assignment by = or :, perhaps with its value on the next line.
         rf"""(?P<name>(?:(?:{_NAMES})[\w\-]{{0,40}}
         |{_SHORT_NAMES}(?=\\?["']|\s{{0,9}}=|(?<=_pass):)|signature(?=\s{{0,9}}=))
@@ -67,7 +81,8 @@ def redact(text: str) -> str:
 
     Removes ``user:password@`` in URIs, and values that are given (by ``=``, ``:``, in a URI's query
     or after an option of a command) to a name that contains ``password``, ``token``, ``secret``,
-    ``api_key``, ``access_key``, ``credential`` or a similar word.
+    ``api_key``, ``access_key``, ``credential`` or a similar word. Also private keys, passwords
+    after ``-u user:``, and tokens with a known beginning.
     """
     for pattern in _SECRETS:
         text = pattern.sub(_hidden, text)

@@ -53,6 +53,14 @@ from tests.kept_sweep import kept_sweep
         (r'{"password": "ab\"cd", "a": 1}', '{"password": "***", "a": 1}'),
         ("authorization: Basic dTpw", 'authorization: "***"'),
         ("X-Api-Key: abc", 'X-Api-Key: "***"'),
+        ("curl -u me:p:w https://h", "curl -u me:*** https://h"),
+        (
+            "run -u 1000:1000 -u x: y --user http://h:1",
+            "run -u 1000:1000 -u x: y --user http://h:1",
+        ),
+        ("['curl', '--user', 'me:pw', 'h']", "['curl', '--user', 'me:***', 'h']"),
+        ("secret:\n  a: |\n    b\n", "secret:\n  a: |\n    b\n"),
+        ("pw: |\n    a b\n    c: d\n  e: 1", "pw: ***\n  e: 1"),
     ],
 )
 def test_only_passwords_are_removed_from_text(text: str, expected: str) -> None:
@@ -125,7 +133,18 @@ PLACES = (
     *("https://u:p@§/w@host/x", "https://u:§@host/x", "s3://K:§@bucket"),
     *("https://h/x?sig=§&a=1", "https://h/x?a=1&X-Amz-Signature=§", "h?X-Amz-Credential=§"),
     *("Authorization: Basic §", "Bearer §", "AWS4 Credential=K, Signature=§", "Cookie: a=§"),
-    *("get(u, auth=('u', '§'))", r"{\"password\": \"§\"}", "secret: |-\n  §", "a;AccountKey=§;b"),
+    *(
+        "get(u, auth=('u', '§'))",
+        r"{\"password\": \"§\"}",
+        "secret: |-\n  a\n  §\n",
+        "a;AccountKey=§;b",
+    ),
+    *("['--password', '§']", "-----BEGIN RSA PRIVATE KEY-----\nA-b: c\n\n§\n-----END"),
+    *(
+        "curl -u u:§",
+        "curl --proxy-user 'u:§'",
+        "key: |\n  -----BEGIN PRIVATE KEY-----\\n§-----END",
+    ),
     *("password := '§'", '"password" => "§"', "if password == '§'", "--auth u:§"),
 )
 
@@ -137,6 +156,38 @@ def test_no_secret_survives(secret: str) -> None:
         assert secret not in hidden
         assert hidden.startswith("cannot start: ")
         assert hidden.endswith(" at 3")
+
+
+TOKENS = st.sampled_from(
+    [
+        *(r"(ghp|gho|ghs|hf|npm)_[A-Za-z0-9]{34,40}", r"github_pat_[A-Z0-9]{22}_[a-z0-9]{59}"),
+        *(r"glpat-[\w-]{20}", r"xox[bp]-\d{10}-\d{10}-[a-z]{9}", r"A[KS]IA[A-Z0-9]{16}"),
+        *(r"AIza[\w-]{35}", r"sk-[a-zA-Z0-9]{48}", r"sk-(proj|ant-api03)-[\w-]{40,90}"),
+        r"eyJ[\w-]{17,30}\.eyJ[\w-]{20,90}\.[\w-]{43}",
+    ]
+).flatmap(lambda pattern: st.from_regex(re.compile(pattern, re.ASCII), fullmatch=True))
+
+
+@given(TOKENS)
+def test_tokens_are_known_by_their_form(token: str) -> None:
+    for place in ("login with §.", "'§'", "x=§&y", "[§, 3]", "/§/", "Bearer §"):
+        hidden = redact(place.replace("§", token))
+        assert token.strip("-")[4:] not in hidden
+        assert "***" in hidden
+
+
+NAMES = st.lists(
+    st.sampled_from(
+        ["sk", "hf", "npm", "push", "task", "FetchPush-v4", "q=1.5", "seed0", "AKIA", "2"]
+    ),
+    min_size=1,
+).flatmap(lambda words: st.sampled_from("-_/. ").map(lambda joint: joint.join(words)))
+
+
+@given(NAMES, st.from_regex(r"\A([0-9a-f]{40}|[0-9a-f]{64}|-?\d{1,30}(\.\d{1,20})?)\Z"))
+def test_names_of_runs_hashes_numbers_and_paths_are_unchanged(name: str, number: str) -> None:
+    for text in (name, number, f"{name}-{number[:12]}", f"/x/{number}/{name}", f"{name}:{number}"):
+        assert redact(f"run {text}, line 3") == f"run {text}, line 3"
 
 
 WORDS = st.from_regex(r"[a-oq-z]{1,9}([.,:=]| = |://h:80/|\('\w'\)|@h|\n)?", fullmatch=True)
@@ -194,7 +245,12 @@ def test_an_error_shows_control_characters_as_text(
 
 
 @pytest.mark.parametrize(
-    "text", ["1" * 100_000, "token" * 20_000, "a://" * 20_000, "secret='" * 9, "secret=([" * 9_999]
+    "text",
+    [
+        *("1" * 100_000, "token" * 20_000, "a://" * 20_000, "secret='" * 9, "secret=([" * 9_999),
+        *("-----BEGIN PRIVATE KEY" * 9_999, "eyJ-eyJ." * 20_000, "-u a:" * 20_000),
+        "pw: |\n a\n" * 9_999,
+    ],
 )
 def test_redaction_takes_linear_time(text: str) -> None:
     """Quadratic, the first would take minutes."""

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from music_rllib.command_line import Json
+from music_rllib.command_line import Json, time_option
 from music_rllib.sweep.commands import Place, Storage
 
 RUN_EXAMPLES = """\
@@ -119,7 +119,7 @@ WaitForNodes = Annotated[
     float | None,
     typer.Option(
         metavar="MINUTES",
-        min=0,
+        parser=time_option,
         help="Time to wait for nodes of a cluster that can hold a run. Default: 5 minutes if no "
         "node has CPUs yet, as after a restart of the head; otherwise 0.",
         show_default=False,

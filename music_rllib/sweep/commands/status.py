@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from music_rllib.command_line import Json, console_for, print_json
+from music_rllib.command_line import Json, console_for, print_json, time_option
 from music_rllib.errors import FAILED, BadInputError
 from music_rllib.sweep.commands import Place, Storage
 
@@ -39,7 +39,10 @@ def status(
         typer.Option("--watch", help="Update the view every few seconds until the sweep ends."),
     ] = False,
     interval: Annotated[
-        float, typer.Option(metavar="SECONDS", help="Time between updates of --watch.")
+        float,
+        typer.Option(
+            metavar="SECONDS", parser=time_option, help="Time between updates of --watch."
+        ),
     ] = 3.0,
     json: Json = False,
 ) -> int:
@@ -119,6 +122,7 @@ def stop(
         float,
         typer.Option(
             metavar="SECONDS",
+            parser=time_option,
             help="Time to wait for the end; the exit code is 1 if the sweep still runs then.",
         ),
     ] = 120.0,

@@ -1,7 +1,9 @@
 """Symmetries: their effect on transitions, and whether real environments have them."""
 
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
+import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from music_rllib.envs.features import Augmentation, Mirror, Symmetries, Symmetry
 from music_rllib.envs.make import Env, augmentation_of, compute_reward_of, make_env
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.replay.trajectories import Floats, ReplayLayout, Transitions
+from music_rllib.tac.algorithm import TAC, TACConfig
 
 LAYOUT = ReplayLayout(observation=4, action=2, goal=1, horizon=9)
 MIRROR = Mirror(positions=(0,), goal=(0,), plane=0.5, signs=(1,), action=(1,), swap=((2, 3),))
@@ -102,6 +105,18 @@ def layout_of(env: Env) -> ReplayLayout:
     return ReplayLayout(spaces["observation"].shape[0], 4, spaces["achieved_goal"].shape[0], 50)
 
 
+class GoalsWithoutReward(gym.Env[dict[str, Floats], Floats]):
+    """Has goals, and a reward that only a step gives."""
+
+    observation_space = gym.spaces.Dict(
+        {
+            name: gym.spaces.Box(-9, 9, (size,), np.float32)
+            for name, size in (("observation", 4), ("achieved_goal", 1), ("desired_goal", 1))
+        }
+    )
+    action_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+
+
 def test_symmetries_that_change_rewards_are_refused() -> None:
     env = make_env("FetchPush-v4")
     shift = (Translation(positions=(0, 3), goal=(0,), distance=0.1),)
@@ -114,6 +129,31 @@ def test_symmetries_that_change_rewards_are_refused() -> None:
 
     with pytest.raises(ValueError, match="must keep rewards: with FetchPush-v4, compute_reward di"):
         augmentation_of(declared, declared.kinds, layout, env, reward=absolute)
+
+
+@pytest.mark.parametrize("goals", ["environment", "zero"])
+def test_goals_change_also_without_a_compute_reward(goals: str) -> None:
+    """A replay without hindsight needs no rewards of other goals."""
+
+    class Runner:
+        layout = LAYOUT
+        env = GoalsWithoutReward()
+
+    config = TACConfig().music(goals=goals)
+    config.replay(hindsight_k=0, symmetries=("mirror",), task_symmetries={"mirror": MIRROR})
+    algorithm = cast(
+        "Any",
+        SimpleNamespace(
+            config=config, _settings=config.settings, _runner_with_environment=lambda: Runner
+        ),
+    )
+    augment = TAC._make_replay(algorithm)._augment
+    assert augment is not None
+    given, after = transitions(1_000), transitions(1_000)
+    augment(np.random.default_rng(0), after)
+    rows = (given.actions != after.actions).any(1)
+    expected = 1 - given.inputs[rows, 4] if goals == "environment" else given.inputs[rows, 4]
+    np.testing.assert_allclose(after.inputs[rows, 4], expected, atol=1e-6)
 
 
 def push(env: Any, mirrored: bool, shift: tuple[float, float], side: float, steps: int) -> Floats:

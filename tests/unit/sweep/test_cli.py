@@ -395,6 +395,22 @@ def test_an_option_or_place_that_cannot_be_is_bad_input(
     )
 
 
+@pytest.mark.parametrize("value", ["nan", "inf", "-1", "1e300", "soon"])
+@pytest.mark.parametrize(
+    "option",
+    ["run --wait-for-nodes", "resume --wait-for-nodes", "status --interval", "stop --wait"],
+)
+def test_a_time_that_no_clock_can_measure_is_refused(
+    program: Program, option: str, value: str
+) -> None:
+    command, name = option.split()
+    result = program(None, command, "results/s", name, value)
+    assert result.exit_code == 2
+    assert result.stderr.endswith(
+        f"Invalid value for '{name}': must be a number from 0 to 1,000,000, got {value}\n"
+    ), result.stderr
+
+
 def test_resume_needs_a_sweep(program: Program, tmp_path: Path) -> None:
     (tmp_path / "results/s").mkdir(parents=True)
     result = program(None, "resume", str(tmp_path / "results/s"))
