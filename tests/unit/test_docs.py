@@ -107,6 +107,7 @@ def test_every_page_is_on_the_documentation_site() -> None:
     [
         *("q_entropy_factorial", "claims_push", "claims_pick_and_place", "claims_slide"),
         "joint_push",
+        "joint_her",
     ],
 )
 def test_the_plan_of_the_claims_is_that_of_their_sweeps(study: str) -> None:
