@@ -142,6 +142,8 @@ def summary_table() -> Iterator[str]:
         setting = STUDIES[sweep.name]
         for claim, other in zip(study.planned, sampled(sweep, study), strict=True):
             paper = PAPER.get((claim.task, claim.first, claim.second), "Figure 7: worse")
+            if setting == JOINT:
+                paper = paper.replace(":", " (with MUSIC):")
             comparison = f"{claim.first} against {claim.second}"
             if claim.first.startswith(BETWEEN_STAGES):
                 paper, comparison = "", "MUSIC-r, q = 1, against HER alone, pretraining not counted"
