@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 GROUPS = {
     "step": "training_step",
     "environment": "environment",
+    "gpu": "gpu",
     "replay": "sampling",
     "training": "whole_training",
     "success": "time_to_success",

@@ -17,6 +17,7 @@ from music_rllib import TACConfig
 from music_rllib.kernels.blas import multiply
 from music_rllib.kernels.compiling import compiled
 from music_rllib.tac.algorithm import TAC
+from music_rllib.tac.minibatches import batch_of
 
 __all__ = ["rows"]
 
@@ -70,12 +71,14 @@ def algorithm(
     estimator: str = "none",
     transitions: int = 10_000,
     direct: bool = True,
+    gpus: float = 0.0,
     **training: Any,
 ) -> TAC:
     """TAC on FetchPush, 10,000 transitions of random actions in its replay, or more, made up."""
     config = TACConfig().environment("FetchPush-v4").env_runners(num_envs_per_env_runner=4)
     config.training(entropic_index=1.5, alpha=0.05, random_steps=10_000, **training)
     config.replay(capacity=transitions, hindsight_k=hindsight_k).debugging(seed=0)
+    config.learners(num_gpus_per_learner=gpus)
     weight = 0.0 if estimator == "none" else 1.0
     config.music(
         agent_indices=range(3),
@@ -92,11 +95,13 @@ def algorithm(
     return algo
 
 
-def updates(algo: TAC) -> Callable[[], None]:
-    """A turn of `UPDATES` updates: sampling and relabelling, and the Learner's call."""
+def updates(algo: TAC, count: int = UPDATES) -> Callable[[], None]:
+    """A turn of `count` updates: sampling and relabelling, and the Learner's call."""
 
     def turn() -> None:
-        algo.learner_group.update(batch=algo.sample_batch(UPDATES), timesteps={})
+        drawn = algo.replay.sample_transitions(count * algo.config.settings.tac.batch_size)
+        batch = batch_of(drawn, algo._sample_trajectories(count))
+        algo.learner_group.update(batch=batch, timesteps={})
 
     return turn
 

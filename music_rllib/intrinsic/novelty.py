@@ -145,9 +145,9 @@ class E3B(_InverseModel):
 
     @torch.no_grad()
     def of_episode(self, observations: Tensor, actions: Tensor) -> Tensor:
-        encoded = self.encode(observations)
+        encoded = self.encode(observations).cpu()  # a GPU's sums differ from run to run
         outer = torch.einsum("ni,nj->nij", encoded, encoded).cumsum(0)[:-1]
-        matrices = outer + self.ridge * torch.eye(encoded.shape[1], device=encoded.device)
+        matrices = outer + self.ridge * torch.eye(encoded.shape[1])
         solved: Tensor = torch.linalg.solve(matrices, encoded[1:])
         return (encoded[1:] * solved).sum(-1)
 

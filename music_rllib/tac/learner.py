@@ -7,6 +7,7 @@ relabels its transitions with the current intrinsic reward and takes one step of
 from __future__ import annotations
 
 import functools
+import os
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
@@ -56,6 +57,8 @@ class TACLearner(TorchLearner):
         torch.set_num_threads(self.config.torch_threads)
         use_threads(self.config.torch_threads)
         self._adam: dict[str, FusedAdam] = {}
+        if self.config.num_gpus_per_learner:
+            _compute_the_same_bits()
         super().build()
         seed = self.config.seed if self.config.seed is not None else torch.seed()
         self._generator = torch.Generator(device=self._device).manual_seed(seed + 7919)
@@ -399,9 +402,26 @@ class TACLearner(TorchLearner):
         self._weights_seq_no = 0
         super().set_state(state)
         if "tac" in state:
-            self._generator.set_state(torch.from_numpy(state["tac"]["generator"].copy()))
             self._grad_updates = int(state["tac"][GRAD_UPDATES])
+            self._set_generator(torch.tensor(state["tac"]["generator"]))
             self._music.load_state(state["tac"]["held_out"])
             self._now.load_state(state["tac"]["scheduled"])
             if self.bonus is not None and "intrinsic" in state["tac"]:
                 self.bonus.load_state(state["tac"]["intrinsic"])
+
+    def _set_generator(self, state: Tensor) -> None:
+        """Continue the random numbers of a state, or begin others if a GPU and a CPU are mixed."""
+        if len(state) == len(self._generator.get_state()):
+            self._generator.set_state(state)
+        else:
+            self._generator.manual_seed(self._generator.initial_seed() + self._grad_updates)
+
+
+def _compute_the_same_bits() -> None:
+    """Choose a GPU's reproducible kernels; RLlib does so only where PyTorch has no CUDA.
+
+    PyTorch prints a warning if a user's intrinsic reward needs an operation that has none.
+    """
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # read with the first product
+    torch.set_deterministic_debug_mode("warn")
+    torch.utils.deterministic.fill_uninitialized_memory = False  # a kernel for each new tensor
