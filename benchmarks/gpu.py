@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Iterator
+from typing import Any
 
 import torch
 
@@ -40,7 +41,12 @@ def rows(repeats: int) -> Iterator[Row]:
 
 
 def _updates(width: int, batch: int, count: int, repeats: int) -> Row:
-    networks = {"hidden_sizes": (width,) * 3, "batch_size": batch, "hindsight_k": 4.0}
+    networks: dict[str, Any] = {
+        "hidden_sizes": (width,) * 3,
+        "batch_size": batch,
+        "hindsight_k": 4.0,
+    }
+    networks |= {"played": 400}
     taken = interleaved(
         {
             "GPU": updates(algorithm(gpus=1.0, **networks)),

@@ -72,9 +72,10 @@ def algorithm(
     transitions: int = 10_000,
     direct: bool = True,
     gpus: float = 0.0,
+    played: int = 10_000,
     **training: Any,
 ) -> TAC:
-    """TAC on FetchPush, 10,000 transitions of random actions in its replay, or more, made up."""
+    """TAC on FetchPush, `played` transitions of random actions in its replay, the rest made up."""
     config = TACConfig().environment("FetchPush-v4").env_runners(num_envs_per_env_runner=4)
     config.training(entropic_index=1.5, alpha=0.05, random_steps=10_000, **training)
     config.replay(capacity=transitions, hindsight_k=hindsight_k).debugging(seed=0)
@@ -89,7 +90,7 @@ def algorithm(
     algo: TAC = config.build_algo()
     if not direct:
         algo.learner_group._learner._compiled = None
-    while len(algo.replay) < 10_000:
+    while len(algo.replay) < played:
         algo.training_step()
     fill(algo.replay, transitions)
     return algo

@@ -72,8 +72,9 @@ def test_training_equals_that_of_a_cpu_to_rounding(settings: dict[str, Any]) -> 
     assert {p.device.type for p in on_gpu.learner_group._learner._online} == {"cuda"}
     found, expected = fingerprint(on_gpu, rounds), fingerprint(build(**settings), rounds)
     for row, same in zip(found, expected, strict=True):
+        # Objects at rest have the lowest reward up to rounding of the bound.
         counted = row.pop(names.MI_REWARD_LOWEST, 0.0)
-        assert counted == pytest.approx(same.pop(names.MI_REWARD_LOWEST, 0.0), abs=0.01)
+        assert counted == pytest.approx(same.pop(names.MI_REWARD_LOWEST, 0.0), abs=0.06)
         assert row == pytest.approx(same, rel=1e-3, abs=1e-4)
 
 
