@@ -80,7 +80,7 @@ def test_training_equals_that_of_a_cpu_to_rounding(settings: dict[str, Any]) -> 
 
 @pytest.mark.usefixtures("local_ray")
 @pytest.mark.parametrize("name", ["music-u", "SMILE", "tqc", "redq", "per", "RND", "E3B"])
-def test_a_restored_checkpoint_continues_with_the_same_numbers(name: str, tmp_path: Path) -> None:
+def test_a_checkpoint_made_on_a_gpu_continues_there_exactly(name: str, tmp_path: Path) -> None:
     register_uneven()
     unbroken = build(where=ON_GPU, **SETTINGS[name])
     fingerprint(unbroken, 2)
