@@ -10,6 +10,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import islice, takewhile
 from typing import NamedTuple
@@ -202,6 +203,8 @@ class RunQueue:
         self._log(stored.reports, *left)
         self._is_new = self._has_begun = False
         self._experiment.client.set_terminated(self.attach().run_id, "FINISHED", times[-1])
+        # The policy, which may wait for long, needs the tags only.
+        self._info = replace(self._info, config={}, settings={})
 
     def _send_policy(self) -> None:
         if self._read_policy is None:

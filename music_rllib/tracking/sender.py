@@ -146,17 +146,19 @@ class Sender(Thread):
 
     def _send_each(self, runs: Iterable[RunQueue], policies: bool) -> None:
         """Send to several runs at once; no more after a failure."""
-        left = deque(runs)
+        left = deque(run for run in runs if run.records and not (policies and run.is_running))
 
         def send() -> None:
             while not (self._failed or self._stopped):
-                if policies and self._has_news:  # metrics, which the next round sends first
-                    return
                 try:
                     run = left.popleft()
                 except IndexError:
                     return
                 self._send_run(run, policies)
+                # The next round sends the new metrics. Each round sends a policy, as there may
+                # always be new metrics, and a run is kept in memory until its policy is sent.
+                if policies and self._has_news:
+                    return
 
         threads = [Thread(target=send, daemon=True) for _ in range(min(self._at_once, len(left)))]
         for thread in threads:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -102,6 +103,8 @@ class TrainingRun:
         gpus: float = 0.0,
     ) -> None:
         self.run, self._gpus = run, gpus
+        # Ray would copy an exception of the environment, which its constructor may not allow.
+        os.environ.setdefault("RAY_AIR_FULL_TRACEBACKS", "1")
         config = algorithm_config(run)
         if gpus:
             config.learners(num_gpus_per_learner=gpus)

@@ -39,6 +39,12 @@ WAIT_SECONDS = 1.0
 """Time between two results of a stopped run."""
 
 
+@cache
+def _request(**bundle: float) -> PlacementGroupFactory:
+    """One object for all runs, because Tune keeps it, and it has some kilobytes."""
+    return PlacementGroupFactory([bundle])
+
+
 class RunTrainable(Trainable):
     """Train a run from its newest checkpoint, or from scratch, to its budget.
 
@@ -49,7 +55,7 @@ class RunTrainable(Trainable):
 
     @classmethod
     def default_resource_request(cls, config: dict[str, Any]) -> PlacementGroupFactory:
-        return PlacementGroupFactory([NodeJob.from_tune(config).resources.bundle])
+        return _request(**NodeJob.from_tune(config).resources.bundle)
 
     def setup(self, config: dict[str, Any]) -> None:
         """Prepare only what can't fail; `step` reports errors with their cause."""

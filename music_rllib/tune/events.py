@@ -15,6 +15,7 @@ from ray.tune.experiment import Trial
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.scheduler import Failure, Listener, Scheduler
 from music_rllib.redaction import redact
+from music_rllib.runtime.process import trim_freed_memory
 from music_rllib.store.history import from_json_lines
 from music_rllib.store.node_store import NodeStore
 from music_rllib.store.storage import StorageError
@@ -80,6 +81,7 @@ class TuneEvents(Callback):
             self._complete(self._node(trial), trial)
         finally:
             _free(trial)
+            trim_freed_memory()
 
     def _complete(self, node: Node, trial: Trial) -> None:
         if (cause := trial.last_result.get(CAUSE)) is not None:
@@ -172,7 +174,8 @@ def _text_of(trial: Trial) -> str:
 
 
 def _free(trial: Trial) -> None:
-    """Free the reports of an ended trial, which Tune keeps and nobody reads."""
+    """Free the reports and the actor's facts of an ended trial, which Tune keeps unread."""
     metadata = trial.run_metadata
+    trial._default_result_or_future = None
     metadata.metric_analysis, metadata.metric_n_steps = {}, {}
     metadata.last_result = {**metadata.last_result, REPORTS: "", NOTES: []}

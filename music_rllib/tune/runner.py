@@ -304,10 +304,21 @@ class _Scheduler(FIFOScheduler):
     """
 
     def choose_trial_to_run(self, tune_controller: Any) -> Trial | None:
+        _forget_ended(tune_controller._tune_controller._actor_manager)
         chosen = super().choose_trial_to_run(tune_controller)
         if chosen is None and cluster_address() is not None:
             tune_controller._tune_controller._cleanup_cached_actors(force_all=True)
         return chosen
+
+
+def _forget_ended(actors: Any) -> None:
+    """Free what Tune keeps of each run whose process is reused: its results, and a request."""
+    waiting = actors._actor_task_events.get_futures()
+    for futures in actors._tracked_actors_to_task_futures.values():
+        futures &= waiting
+    tasks = actors._pending_actors_to_enqueued_actor_tasks
+    for actor in tasks.keys() - actors._pending_actors_to_attrs.keys():
+        del tasks[actor]
 
 
 def _may_share_processes(sweep: OpenSweep) -> bool:

@@ -16,6 +16,13 @@ from numpy.typing import NDArray
 Array = NDArray[np.float32]
 
 
+class GripperError(Exception):
+    """It needs two arguments, so it can be neither copied nor pickled."""
+
+    def __init__(self, what: str, said: str) -> None:
+        super().__init__(f"{what}\n{said}")
+
+
 class Point(gym.Env[dict[str, Array], Array]):
     """Observation: agent (2) and object (2), which moves with the agent's actions.
 
@@ -54,7 +61,7 @@ class Point(gym.Env[dict[str, Array], Array]):
         self._steps += 1
         if self._steps == self._fail_at:
             said = os.environ.get("POINT_SAYS", "look at the second screw")
-            raise RuntimeError(f"the gripper fell off\n{said}")
+            raise GripperError("the gripper fell off", said)
         moved = self._state + np.concatenate([0.1 * action, 0.05 * action])
         self._state = np.clip(moved, -2, 2).astype(np.float32)
         if self._steps == self._nan_at:

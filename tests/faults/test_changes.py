@@ -7,9 +7,13 @@ import signal
 import threading
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 import yaml
+from ray import ObjectRef
+from ray.air.execution._internal.actor_manager import RayActorManager
+from ray.tune import PlacementGroupFactory
 from ray.tune.search import Searcher
 
 from music_rllib.config.load import load_config
@@ -24,7 +28,7 @@ from music_rllib.store.history import RunResult
 from music_rllib.store.lease import Lease, LeaseFile
 from music_rllib.store.storage import open_storage
 from music_rllib.sweep.driver_lock import alone, driving
-from music_rllib.tune.runner import DagSearcher, SharedRuns
+from music_rllib.tune.runner import DagSearcher, SharedRuns, _forget_ended
 
 RESULT = RunResult(label="l", env_steps=1200, seconds=1.0, metrics={})
 
@@ -245,3 +249,24 @@ def test_a_driver_takes_the_next_free_run(
     assert searcher.next() == node, "its lease is not renewed"
     worker = sweep.store.work_folder(node.key).lease
     assert worker.acquire(Lease.of_this_process("mine")) is None, "it need not watch it"
+
+
+def test_tune_keeps_nothing_of_ended_runs() -> None:
+    """Ray's own manager keeps results of reused processes, and requests that it cancelled."""
+    manager = RayActorManager(resource_manager=MagicMock())
+    live, cancelled = (
+        manager.add_actor(object, {}, PlacementGroupFactory([{"CPU": 1}])) for _ in range(2)
+    )
+    for actor in (live, cancelled):
+        manager.schedule_actor_task(actor, "stop")
+    manager.remove_actor(cancelled)
+    tasks, futures = (
+        manager._pending_actors_to_enqueued_actor_tasks,
+        manager._tracked_actors_to_task_futures,
+    )
+    future, ended = ObjectRef.from_random(), ObjectRef.from_random()
+    manager._actor_task_events.track_future(future)
+    futures[live] |= {future, ended}
+    assert cancelled in tasks
+    _forget_ended(manager)
+    assert (set(tasks), futures[live]) == ({live}, {future})

@@ -110,7 +110,7 @@ def ended(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ended]:
 def test_a_failure_is_explained_and_the_others_finish(ended: Ended) -> None:
     assert (ended.code, ended.errors) == (1, "")
     output = ended.output
-    assert "pretrain/Broken/seed0: FAILED: RuntimeError: the gripper fell off" in output
+    assert "pretrain/Broken/seed0: FAILED: GripperError: the gripper fell off" in output
     assert "look at postgresql://db/screws (password=***, 'token': '***') \\u001b[2J" in output
     assert "finetune/Broken/q=1/seed0: skipped, it starts from pretrain/Broken/seed0" in output
     assert [(row[0].split("/")[1], row[-1]) for row in rows(output)] == [
@@ -120,12 +120,12 @@ def test_a_failure_is_explained_and_the_others_finish(ended: Ended) -> None:
     ]
     log = Path(re.findall(r"whole traceback: (.*)", output)[0])
     text = log.read_text()
-    assert 'raise RuntimeError(f"the gripper fell off' in text
+    assert 'raise GripperError("the gripper fell off' in text
     assert "point_env.py" in text
     runs = ended.runs()
     failed = runs["seed 0 Broken pretrain"]
     assert failed.info.status == "FAILED"
-    assert failed.data.tags[names.TAG_FAILURE].startswith("RuntimeError: the gripper fell off")
+    assert failed.data.tags[names.TAG_FAILURE].startswith("GripperError: the gripper fell off")
     assert not [name for name in runs if "Broken finetune" in name]
 
 

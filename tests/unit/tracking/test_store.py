@@ -6,7 +6,7 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
@@ -230,3 +230,33 @@ def test_the_end_waits_for_mlflow_while_there_is_progress(monkeypatch: pytest.Mo
     assert said == sorted(said, reverse=True)
     assert len(said) > 1
     thread.stop()
+
+
+class DeliveredRun:
+    """A run that waits for its policy to be sent, while `news` arrives with everything sent."""
+
+    refused, source, is_running = None, None, False
+
+    def __init__(self, name: str, news: Callable[[], None]) -> None:
+        self.node_key, self.records, self._news = name, 1, news
+
+    def send(self, *, policy: bool) -> None:
+        self._news()
+        self.records -= policy
+
+
+def test_policies_are_sent_although_metrics_never_pause() -> None:
+    """Otherwise a sweep of many short runs keeps the queues of all of them until its end."""
+    thread = sender.Sender("the store")
+
+    def news() -> None:
+        thread._has_news = True
+
+    training = DeliveredRun("training", news)
+    training.is_running = True
+    for run in (training, *(DeliveredRun(str(i), news) for i in range(5))):
+        thread.add(cast("Any", run))
+    for left in (5, 4, 3, 2, 1):
+        assert thread._send_round()
+        assert thread.pending().records == left
+    assert list(thread._runs) == [training]
