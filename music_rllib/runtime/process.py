@@ -129,12 +129,6 @@ def give_back_freed_memory() -> bool:
     )
 
 
-def trim_freed_memory() -> None:
-    """Return freed memory between used blocks, which the settings do not: 0.05 MB per trial."""
-    with contextlib.suppress(OSError, AttributeError):  # not glibc
-        ctypes.CDLL(None).malloc_trim(0)
-
-
 def _set_allocator(options: Mapping[int, int]) -> bool:
     try:
         mallopt = ctypes.CDLL(None).mallopt

@@ -15,7 +15,6 @@ from ray.tune.experiment import Trial
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.scheduler import Failure, Listener, Scheduler
 from music_rllib.redaction import redact
-from music_rllib.runtime.process import trim_freed_memory
 from music_rllib.store.history import from_json_lines
 from music_rllib.store.node_store import NodeStore
 from music_rllib.store.storage import StorageError
@@ -81,7 +80,6 @@ class TuneEvents(Callback):
             self._complete(self._node(trial), trial)
         finally:
             _free(trial)
-            trim_freed_memory()
 
     def _complete(self, node: Node, trial: Trial) -> None:
         if (cause := trial.last_result.get(CAUSE)) is not None:
