@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Self
-from urllib.parse import parse_qsl, urlsplit
+from urllib.parse import parse_qsl, unquote, urlsplit
 
 from music_rllib.errors import TrackingError
 from music_rllib.experiment.sweep_files import SweepLocation, as_json
@@ -139,7 +139,7 @@ def resolve_store(tracking_uri: str | None, storage: str) -> TrackingStore:
     remote = is_remote(storage)
     folder = None if remote else sweep_folder(storage, "").expanduser().absolute()
     if folder is None:
-        artifacts = f"{storage.partition('?')[0].rstrip('/')}/mlartifacts"
+        artifacts = f"{redact(storage).partition('?')[0].rstrip('/')}/mlartifacts"
     else:
         artifacts = (folder / "mlartifacts").as_uri()
     if tracking_uri is None:
@@ -156,7 +156,11 @@ def resolve_store(tracking_uri: str | None, storage: str) -> TrackingStore:
     if redact(known) == uri:  # the sweep has its URI without the password
         uri = known
     if storage.startswith("s3://") and not is_server:
-        options = dict(parse_qsl(urlsplit(storage).query))
+        bucket = urlsplit(storage)
+        if bucket.username and bucket.password:
+            os.environ.setdefault("AWS_ACCESS_KEY_ID", unquote(bucket.username))
+            os.environ.setdefault("AWS_SECRET_ACCESS_KEY", unquote(bucket.password))
+        options = dict(parse_qsl(bucket.query))
         if endpoint := options.get("endpoint_override"):  # MLflow writes artifacts there itself
             if "://" not in endpoint:
                 endpoint = f"{options.get('scheme', 'https')}://{endpoint}"

@@ -120,6 +120,19 @@ def test_a_database_keeps_artifacts_in_the_storage() -> None:
     assert "u:p" not in store.ui_command()
 
 
+def test_keys_of_a_bucket_are_used_for_artifacts_and_not_written(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """MLflow writes the place of artifacts into its database."""
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.setenv(name, "")  # restored after the test
+        monkeypatch.delenv(name)
+    store = resolve_store("sqlite:////x.db", "s3://AKIA:ab%2Fc@bucket/sweeps?region=eu")
+    assert store.artifact_root == "s3://bucket/sweeps/mlartifacts"
+    assert os.environ["AWS_ACCESS_KEY_ID"] == "AKIA"
+    assert os.environ["AWS_SECRET_ACCESS_KEY"] == "ab/c"
+
+
 @pytest.mark.parametrize(
     ("uri", "rule"),
     [
@@ -259,4 +272,4 @@ def test_policies_are_sent_although_metrics_never_pause() -> None:
     for left in (5, 4, 3, 2, 1):
         assert thread._send_round()
         assert thread.pending().records == left
-    assert list(thread._runs) == [training]
+    assert [run.node_key for run in thread._runs] == ["training"]
