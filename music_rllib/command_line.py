@@ -26,21 +26,19 @@ Json = Annotated[
     bool, typer.Option("--json", help="One JSON document on stdout, messages on stderr.")
 ]
 
-MAX_TIME = 1_000_000
-
 
 def time_option(text: str | float) -> float:
     """Parser of an option that is a time: a float accepts NaN, infinity and negative numbers.
 
     Raises:
-        typer.BadParameter: The value is not a number from 0 to `MAX_TIME`.
+        typer.BadParameter: The value is not a number from 0 to 1,000,000.
     """
     try:
         value = float(text)
     except ValueError:
         value = math.nan
-    if not 0 <= value <= MAX_TIME:
-        raise typer.BadParameter(f"must be a number from 0 to {MAX_TIME:,}, got {text}")
+    if not 0 <= value <= 1e6:
+        raise typer.BadParameter(f"must be a number from 0 to 1,000,000, got {text}")
     return value
 
 

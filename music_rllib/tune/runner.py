@@ -315,7 +315,7 @@ def _forget_ended(actors: Any) -> None:
     """Free what Tune keeps of each run whose process is reused: its results, and a request."""
     waiting = actors._actor_task_events.get_futures()
     for futures in actors._tracked_actors_to_task_futures.values():
-        futures &= waiting
+        futures.intersection_update(waiting)
     tasks = actors._pending_actors_to_enqueued_actor_tasks
     for actor in tasks.keys() - actors._pending_actors_to_attrs.keys():
         del tasks[actor]
