@@ -97,10 +97,11 @@ def test_a_checkpoint_made_on_a_gpu_continues_there_exactly(name: str, tmp_path:
     assert on_cpu.grad_updates < (fingerprint(on_cpu, 2), on_cpu.grad_updates)[1]
 
 
+@pytest.mark.timeout(900)
 def test_a_sweep_with_two_runs_on_a_gpu_is_killed_resumed_and_read_without_one(
     tmp_path: Path,
 ) -> None:
-    document = sweeps.document(resources={"num_cpus": 4, "gpus_per_run": 0.5})
+    document = sweeps.document(resources={"num_cpus": 2, "gpus_per_run": 0.5})
     document["defaults"]["env_steps"] = 2000
     unbroken, cut = (sweeps.program(tmp_path / name) for name in ("unbroken", "cut"))
     for program in (unbroken, cut):
@@ -117,7 +118,8 @@ def test_a_sweep_with_two_runs_on_a_gpu_is_killed_resumed_and_read_without_one(
     cut.write(document | {"resources": {"num_cpus": 2}})
     output = sweeps.finish(cut)
     assert output.count("finished earlier, reused") == 3
-    cut.end_all()
+    for program in (unbroken, cut):
+        program.end_all()
     played = subprocess.run(
         [sys.executable, "-m", "music_rllib", "evaluate", "finetune/q=2/seed0", "--json"],
         cwd=cut.folder, env=cut.environment, capture_output=True, text=True, check=False,
