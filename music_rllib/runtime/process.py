@@ -135,3 +135,16 @@ def _set_allocator(options: Mapping[int, int]) -> bool:
     except (OSError, AttributeError):  # not glibc
         return False
     return all(mallopt(option, value) == 1 for option, value in options.items())
+
+
+def use_reproducible_gpu_kernels() -> None:
+    """Choose a GPU's reproducible kernels; RLlib does so only where PyTorch has no CUDA.
+
+    PyTorch prints a warning if a user's intrinsic reward needs an operation that has none.
+    """
+    import torch
+
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # read with the first product
+    torch.set_deterministic_debug_mode("warn")
+    # Else each new tensor is filled by another kernel.
+    torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]

@@ -7,7 +7,6 @@ relabels its transitions with the current intrinsic reward and takes one step of
 from __future__ import annotations
 
 import functools
-import os
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
@@ -31,7 +30,7 @@ from music_rllib.intrinsic.interface import Sizes
 from music_rllib.intrinsic.music import Music
 from music_rllib.intrinsic.relabeling import RewardLearner, make_reward
 from music_rllib.replay.trajectories import Trajectory
-from music_rllib.runtime.process import keep_freed_memory
+from music_rllib.runtime.process import keep_freed_memory, use_reproducible_gpu_kernels
 from music_rllib.runtime.quiet import quiet_third_parties
 from music_rllib.schedules import Quantity
 from music_rllib.tac import diagnostics
@@ -58,7 +57,7 @@ class TACLearner(TorchLearner):
         use_threads(self.config.torch_threads)
         self._adam: dict[str, FusedAdam] = {}
         if self.config.num_gpus_per_learner:
-            _compute_the_same_bits()
+            use_reproducible_gpu_kernels()
         super().build()
         seed = self.config.seed if self.config.seed is not None else torch.seed()
         self._generator = torch.Generator(device=self._device).manual_seed(seed + 7919)
@@ -415,14 +414,3 @@ class TACLearner(TorchLearner):
             self._generator.set_state(state)
         else:
             self._generator.manual_seed(self._generator.initial_seed() + self._grad_updates)
-
-
-def _compute_the_same_bits() -> None:
-    """Choose a GPU's reproducible kernels; RLlib does so only where PyTorch has no CUDA.
-
-    PyTorch prints a warning if a user's intrinsic reward needs an operation that has none.
-    """
-    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # read with the first product
-    torch.set_deterministic_debug_mode("warn")
-    # Else each new tensor is filled by another kernel.
-    torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
