@@ -28,6 +28,7 @@ Item = dict[str, str]
 class Cleaning:
     """The folders that `clean` deletes, and those that it keeps."""
 
+    storage: StorageFolder
     folders: list[StorageFolder] = field(default_factory=list)
     """Folders to delete, in the storage or on this machine."""
     items: list[Item] = field(default_factory=list)
@@ -51,7 +52,9 @@ class Cleaning:
             BadInputError: Another process computes one of the runs; nothing was deleted.
         """
         mine, files = Lease.of_this_process("clean"), [work.lease for work in self.begun]
-        holders = [holder for file in files if (holder := file.acquire(mine)) is not None]
+        # Together, since each takes seconds in a bucket, and a lease lasts a minute.
+        found = self.storage.map(lambda file: file.acquire(mine), files)
+        holders = [holder for holder in found if holder is not None]
         if holders:
             for file in files:
                 file.release(mine.owner)
@@ -87,7 +90,7 @@ def find_deletable(location: SweepLocation, *, unfinished: bool, everything: boo
     finished = set((storage / "nodes").having(MANIFEST, [node["key"] for node in nodes]))
     begun = {*(storage / "work").folders()}
     continued = {*(storage / CONTINUATIONS).folders()}
-    cleaning = Cleaning()
+    cleaning = Cleaning(storage=storage)
     for node in nodes:
         key, label = node["key"], node["label"]
         result = storage / "nodes" / key
