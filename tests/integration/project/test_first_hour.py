@@ -41,7 +41,7 @@ SECONDS = {
 # A server without accounts has nobody to name.
 HARMLESS = ("mlflow/users/current",)
 EXPECTED = re.compile(
-    r"\[ *\d+:\d\d\] (q=|starting a local Ray$|best so far: q = )"
+    r"\[ *\d+:\d\d\] (q=|starting a local Ray$|best so far: (train )?q = )"
     r"|(stage|run|train|q=\S+)[ :/]|  |Sweep |Results |Storage: |3 runs, |"
     r"Report: |Picture: |Compare in MLflow: |Open MLflow's pages with: "
 )

@@ -120,7 +120,8 @@ def test_a_storm_is_answered_or_asked_to_come_again(service: Service) -> None:
         seen = asyncio.run(storm(service.url, service.policy, 600, TOKEN))
         for client in clients:
             client.settimeout(60)
-            assert client.recv(65536).startswith(b"HTTP/1.1 408 ")
+            # 503 if too many others waited when it came.
+            assert client.recv(65536).startswith((b"HTTP/1.1 408 ", b"HTTP/1.1 503 "))
     assert seen.count(200, 408, 503) == 600  # 408 if this machine takes longer than 10 s
     assert seen.count(200) >= 32
     assert (seen.count(503) > 0, seen.without_retry) == (True, 0)
