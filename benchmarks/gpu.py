@@ -41,16 +41,16 @@ def rows(repeats: int) -> Iterator[Row]:
 
 
 def _updates(width: int, batch: int, count: int, repeats: int) -> Row:
-    networks: dict[str, Any] = {
+    options: dict[str, Any] = {
         "hidden_sizes": (width,) * 3,
         "batch_size": batch,
         "hindsight_k": 4.0,
+        "played": 400,
     }
-    networks |= {"played": 400}
     taken = interleaved(
         {
-            "GPU": updates(algorithm(gpus=1.0, **networks)),
-            "CPU": updates(algorithm(**networks), count),
+            "GPU": updates(algorithm(gpus=1.0, **options)),
+            "CPU": updates(algorithm(**options), count),
         },
         repeats,
     )

@@ -110,8 +110,8 @@ _THOROUGH_SECONDS = 1800
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Mark each test with its folder's tier, so that ``-m`` works without markers in every file.
 
-    The long files come first. What is thorough, and takes many minutes, is left out unless
-    ``-m`` asks for it.
+    The long files come first. What is thorough, and takes many minutes, or needs a GPU is left out
+    unless ``-m`` asks for it.
     """
     for item in items:
         if item.path.is_relative_to(_TESTS):
@@ -120,15 +120,16 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
                 item.add_marker(tier)
     places = {_TESTS / name: place for place, name in enumerate(LONG)}
     items.sort(key=lambda item: places.get(item.path, len(LONG)))
-    thorough = [item for item in items if item.get_closest_marker("thorough")]
-    if "thorough" in (config.option.markexpr or ""):
-        for item in thorough:
-            if item.get_closest_marker("timeout") is None:
-                item.add_marker(pytest.mark.timeout(_THOROUGH_SECONDS))
-        return
-    if thorough:
-        config.hook.pytest_deselected(items=thorough)
-        items[:] = [item for item in items if not item.get_closest_marker("thorough")]
+    asked = config.option.markexpr or ""
+    for marker in ("thorough", "gpu"):
+        marked = [item for item in items if item.get_closest_marker(marker)]
+        if marker not in asked:
+            config.hook.pytest_deselected(items=marked)
+            items[:] = [item for item in items if not item.get_closest_marker(marker)]
+        elif marker == "thorough":
+            for item in marked:
+                if item.get_closest_marker("timeout") is None:
+                    item.add_marker(pytest.mark.timeout(_THOROUGH_SECONDS))
 
 
 def pytest_collection_finish() -> None:

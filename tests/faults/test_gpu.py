@@ -1,6 +1,6 @@
 """Training on a GPU: the numbers of a CPU, exact resumption, sweeps whose runs share a GPU.
 
-`pytest -m gpu` runs them on a machine with an NVIDIA GPU; elsewhere they are skipped.
+`pytest -m gpu` runs them, and they fail on a machine without an NVIDIA GPU.
 """
 
 from __future__ import annotations
@@ -27,10 +27,7 @@ from tests.integration.algorithm.test_tac_algorithm import (
     register_uneven,
 )
 
-pytestmark = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="PyTorch sees no NVIDIA GPU"),
-]
+pytestmark = pytest.mark.gpu
 
 ON_GPU = {"num_gpus_per_learner": 1}
 SETTINGS: dict[str, dict[str, Any]] = {
@@ -42,6 +39,11 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "E3B": {"intrinsic.reward": "e3b"},
     "DIAYN": {"intrinsic.reward": "diayn"},
 }
+
+
+@pytest.fixture(autouse=True)
+def gpu() -> None:
+    assert torch.cuda.is_available(), "these tests need an NVIDIA GPU that PyTorch sees"
 
 
 @pytest.fixture
