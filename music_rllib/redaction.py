@@ -49,9 +49,12 @@ _SECRETS = tuple(
         # An option of a command: --password x.
         rf"""(?P<name>(?<![\w\-])--?(?:[\w\-]{{0,40}}?(?:{_NAMES})[\w\-]{{0,40}}
         |(?:[\w\-]{{0,40}}-)?(?:pass|pw|auth))(?P<equals>(?:["'],)?[ \t]+))(?!-){_VALUE}""",
-        # Of curl: -u user:password. Two numbers are ids of a user and a group.
-        r"""(?P<name>(?<![\w\-])(?:-u|--(?:proxy-)?user)(?:["'],)?[ \t=]{1,9}["']?
-        (?!\d+:\d+\b)[\w.@+\-]{1,99}(?P<equals>:))(?!//)[^\s'"]+""",
+        # Of MySQL and sshpass: -px. A space after -p of MySQL means that it asks for a password.
+        rf"""(?-i:(?P<name>(?:\b(?:mysql|mariadb)[\w\-]{{0,20}}\b[^\n|;&]{{0,400}}?[\s"']-p(?!["']?[,\s\]])
+        |\bsshpass["',\s]+(?:-v["',\s]+)?-p)(?P<equals>(?:["'],)?[ \t]{{0,9}}))){_VALUE}""",
+        # A webhook of Slack or Discord, to which anyone who knows its address can post.
+        r"""(?P<name>\b(?:hooks\.slack\.com/\w{1,20}|discord(?:app)?\.com/api/(?:v\d{1,3}/)?webhooks)
+        /(?P<equals>))[\w/\-]+""",
         # A block of YAML: password: |
         rf"""(?P<name>(?:{_NAMES}|{_SHORT_NAMES})[\w\-]{{0,40}}["']?[ \t]{{0,9}}
         (?P<equals>:[ \t]{{1,9}}))[|>][\d+\-]{{0,2}}[ \t]{{0,9}}
@@ -64,6 +67,14 @@ _SECRETS = tuple(
         {_VALUE}""",
     )
 )
+_CURL = re.compile(r"(?:\b(?:curl|wget)\b|--(?:proxy-)?user\b)(?:\\\n|[^\n])*", re.I)
+"""A line from such a command or option on. `-u` of other commands takes no password."""
+_CURL_USER = re.compile(
+    r"""(?P<name>(?<![\w\-])(?:-[a-z]{0,9}?u|--(?:proxy-)?user\b(?!-))(?:["'],)?[ \t=]{0,9}["']?
+    (?!\d+:\d+\b)[\w.@+\-]{1,99}(?P<equals>:))(?!//)[^\s'"]+""",
+    re.IGNORECASE | re.VERBOSE,
+)
+"""A user and a password. Two numbers are ids of a user and a group."""
 # C0 and C1 controls except line breaks and tabs, marks that change the direction of writing,
 # invisible marks, and unpaired surrogates, which no terminal accepts.
 _UNPRINTABLE = re.compile(
@@ -82,11 +93,12 @@ def redact(text: str) -> str:
     Removes ``user:password@`` in URIs, and values that are given (by ``=``, ``:``, in a URI's query
     or after an option of a command) to a name that contains ``password``, ``token``, ``secret``,
     ``api_key``, ``access_key``, ``credential`` or a similar word. Also private keys, passwords
-    after ``-u user:``, and tokens with a known beginning.
+    of ``curl -u user:``, ``mysql -p`` and ``sshpass -p``, addresses of webhooks, and tokens with a
+    known beginning.
     """
     for pattern in _SECRETS:
         text = pattern.sub(_hidden, text)
-    return text
+    return _CURL.sub(lambda command: _CURL_USER.sub(_hidden, command[0]), text)
 
 
 def _hidden(match: re.Match[str]) -> str:

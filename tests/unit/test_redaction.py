@@ -59,6 +59,23 @@ from tests.kept_sweep import kept_sweep
             "run -u 1000:1000 -u x: y --user http://h:1",
         ),
         ("['curl', '--user', 'me:pw', 'h']", "['curl', '--user', 'me:***', 'h']"),
+        ("curl -sume:pw h -U you:p2", "curl -sume:*** h -U you:***"),
+        ("curl h \\\n  -u me:pw\nsort -u a:b", "curl h \\\n  -u me:***\nsort -u a:b"),
+        ("python -u train.py:12 | sort -u a:b", "python -u train.py:12 | sort -u a:b"),
+        ("python -u x.py --user me:pw", "python -u x.py --user me:***"),
+        ("mysqldump -P 3306 -uroot -ppw -p db", "mysqldump -P 3306 -uroot -p*** -p db"),
+        ("mysql -P3306 -p db --port=1", "mysql -P3306 -p db --port=1"),
+        ("['mysql', '-p', 'db']", "['mysql', '-p', 'db']"),
+        ("sshpass -v -ppw ssh -p 22 h", "sshpass -v -p*** ssh -p 22 h"),
+        ("sshpass -e ssh -p 22 h", "sshpass -e ssh -p 22 h"),
+        (
+            "https://hooks.slack.com/services/T0/B0/xyz failed",
+            "https://hooks.slack.com/services/*** failed",
+        ),
+        (
+            "'https://discord.com/api/v10/webhooks/1/x-y_z'",
+            "'https://discord.com/api/v10/webhooks/***'",
+        ),
         ("secret:\n  a: |\n    b\n", "secret:\n  a: |\n    b\n"),
         ("pw: |\n    a b\n    c: d\n  e: 1", "pw: ***\n  e: 1"),
     ],
@@ -143,6 +160,11 @@ PLACES = (
     *(
         "curl -u u:§",
         "curl --proxy-user 'u:§'",
+        "curl -uu:§",
+        "mysql -u root -p'§'",
+        "['mariadb', '-p§', 'db']",
+        "sshpass -p '§' ssh h",
+        "['sshpass', '-p', '§']",
         "key: |\n  -----BEGIN PRIVATE KEY-----\\n§-----END",
     ),
     *("password := '§'", '"password" => "§"', "if password == '§'", "--auth u:§"),
@@ -248,8 +270,8 @@ def test_an_error_shows_control_characters_as_text(
     "text",
     [
         *("1" * 100_000, "token" * 20_000, "a://" * 20_000, "secret='" * 9, "secret=([" * 9_999),
-        *("-----BEGIN PRIVATE KEY" * 9_999, "eyJ-eyJ." * 20_000, "-u a:" * 20_000),
-        "pw: |\n a\n" * 9_999,
+        *("-----BEGIN PRIVATE KEY" * 9_999, "eyJ-eyJ." * 20_000),
+        *("pw: |\n a\n" * 9_999, "curl -u a:" * 20_000, "mysql -" * 20_000, "sshpass -P" * 20_000),
     ],
 )
 def test_redaction_takes_linear_time(text: str) -> None:
