@@ -27,6 +27,7 @@ from music_rllib.results.conditions import (
     StageRuns,
     Values,
     find_stages,
+    stages_together,
     whole_setting,
 )
 from music_rllib.results.data import RunRecord, Sweep, with_pretraining
@@ -95,7 +96,7 @@ def study_of(
     Args:
         sweep: The runs.
         stage: Stage of the comparisons outside the plan; None: the plan's, or the last stage that
-            trains for the task.
+            trains for the task. If this one has a single condition, all stages of the plan.
         metric: Metric of the comparisons outside the plan; None: each task's primary one.
         maximised: Whether higher values of `metric` are better.
     """
@@ -105,6 +106,10 @@ def study_of(
     chosen = stages.get(stage or (latest.plan.stage if latest else ""))
     if chosen is None and stage is None:
         chosen = next((s for s in reversed(stages.values()) if s.has_task_reward), None)
+    pairs = _pairs(chosen.compared) if chosen else []
+    if latest and not pairs and stage in (None, latest.plan.stage):
+        of_hypotheses = [found for name, found in stages.items() if name in latest.plan.stages]
+        chosen = stages_together(of_hypotheses) or chosen
     untested: list[str] = []
     planned = list(_of_plan(sweep, stages, plan, (), untested)) if plan else []
     without_test = len(untested)
@@ -124,9 +129,9 @@ def study_of(
             for task in chosen.tasks
         }
         means += _means(counted, chosen, measures)
-        pairs = [(x.short_label, y.short_label, [(x, y)]) for x, y in _pairs(chosen.compared)]
+        labelled = [(x.short_label, y.short_label, [(x, y)]) for x, y in pairs]
         known_subjects = {claim.subject for claim in (*planned, *unplanned)}
-        of_stage = claims_of(counted, pairs, measures, margin)
+        of_stage = claims_of(counted, labelled, measures, margin)
         unplanned += [claim for claim in of_stage if claim.subject not in known_subjects]
     of_plan = [stages[name] for name in (plan.plan.stages if plan else ()) if name in stages]
     compared = [run for one in filter(None, [chosen, *of_plan]) for run in _runs(one)]

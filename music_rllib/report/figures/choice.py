@@ -52,7 +52,7 @@ OF_ALL_STAGES = tuple(
 """Curves that are drawn of all stages together; displacement shows an effect before success."""
 MOST_FACETS = 8
 """Largest number of subplots that the curves of one task are spread over."""
-MOST_LINES = 8
+MOST_LINES = 10
 """Largest number of lines in a subplot of the overview."""
 
 

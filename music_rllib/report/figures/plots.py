@@ -3,7 +3,7 @@
 A q has the same color in every figure. The values of q that the paper compares have colors of Okabe
 and Ito's palette for color-blind readers, adjusted until each has enough contrast on white and on
 black paper. Other values of q mix the colors of their neighbors. Conditions that share a color have
-different markers and dashes.
+different markers and dashes. Where all conditions have the same q, each has a color and a marker.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import functools
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import cycle, islice
 from typing import Literal, NamedTuple
 
 import matplotlib as mpl
@@ -39,6 +40,15 @@ _ANCHORS = (
     (3.0, "#a0522d"),
 )
 _UNKNOWN = "#808080"
+_OF_EQUAL_Q = (
+    *(color for _, color in _ANCHORS),
+    "#b58900",
+    "#e0529c",
+    "#7a8a00",
+    _UNKNOWN,
+    "#9a4dd6",
+)
+"""Colors of conditions that differ in other settings than q, after the color of their q."""
 _MARKERS = "osD^vPX"
 _DASHES: tuple[tuple[float, ...], ...] = (
     (),
@@ -88,13 +98,20 @@ def marker_of(entropic_index: str) -> str:
 def styles_of(conditions: tuple[Condition, ...]) -> Mapping[Condition, Style]:
     """Styles of conditions: color and marker by q, other markers and dashes for similar colors."""
     styles: dict[Condition, Style] = {}
-    for condition in conditions:
-        color, marker = color_of(condition.entropic_index), marker_of(condition.entropic_index)
-        alike = [style for style in styles.values() if _are_alike(color, style.color)]
-        first, taken = _MARKERS.find(marker), {style.marker for style in alike}
-        others = (_MARKERS[(first + turn) % len(_MARKERS)] for turn in range(1, len(_MARKERS)))
-        marker = next((free for free in (marker, *others) if free not in taken), marker)
-        styles[condition] = Style(color, marker, _DASHES[len(alike) % len(_DASHES)])
+    colors = [color_of(condition.entropic_index) for condition in conditions]
+    same_q = len({condition.entropic_index for condition in conditions}) == 1
+    if same_q:
+        others = [color for color in _OF_EQUAL_Q if not _are_alike(color, colors[0])]
+        colors = list(islice(cycle([colors[0], *others]), len(colors)))
+    for condition, color in zip(conditions, colors, strict=True):
+        marker = marker_of(condition.entropic_index)
+        alike = [style for style in styles.values() if same_q or _are_alike(color, style.color)]
+        taken = {style.marker for style in alike}
+        first = _MARKERS.find(marker)
+        turned = (_MARKERS[(first + turn) % len(_MARKERS)] for turn in range(1, len(_MARKERS)))
+        marker = next((free for free in (marker, *turned) if free not in taken), marker)
+        turn = len(alike) // len(_MARKERS) if same_q else len(alike)
+        styles[condition] = Style(color, marker, _DASHES[turn % len(_DASHES)])
     return styles
 
 

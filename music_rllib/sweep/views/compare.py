@@ -13,7 +13,6 @@ from music_rllib.experiment.sweep_files import SweepLocation
 from music_rllib.names import ShortLabels
 from music_rllib.results.analysis import analyse_stage, mixed
 from music_rllib.results.answer import answer, study_data
-from music_rllib.results.conditions import find_stages
 from music_rllib.results.data import Sweep
 from music_rllib.results.read import SweepRead, read_stored
 from music_rllib.results.study import study_of
@@ -61,8 +60,7 @@ def compare_stage(
         "earlier": sweep.earlier,
     }
     earlier = [Text(sweep.earlier)] if sweep.earlier else []
-    found = (one for one in find_stages(sweep) if one.name == settings.name)
-    final = next((analyse_stage(sweep, one, shown) for one in found), None)
+    final = analyse_stage(sweep, study.stage, shown) if study.stage else None
     if final is None or not any(scope.finals for scope in final.scopes):
         text = f"Stage {settings.name} of {sweep.name} has no finished run yet."
         return document, Group(Text(text), *earlier)

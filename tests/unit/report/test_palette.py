@@ -68,9 +68,11 @@ def test_a_color_depends_on_q_alone() -> None:
     assert len({marker_of(q) for q in grid}) == len(grid)
 
 
-def test_six_conditions_with_the_same_q_have_different_dashes() -> None:
+def test_conditions_with_the_same_q_differ_with_and_without_color() -> None:
     conditions = tuple(
-        Condition(entropic_index="1", others=(("α", str(a)),), runs=()) for a in range(6)
+        Condition(entropic_index="1", others=(("α", str(a)),), runs=()) for a in range(10)
     )
     styles = styles_of(conditions).values()
-    assert len({style.line for style in styles}) == 6
+    assert len({style.color for style in styles}) == 10
+    assert len({(style.marker, style.line) for style in styles}) == 10
+    assert min(contrast(style.color, paper) for style in styles for paper in (LIGHT, DARK)) >= 3

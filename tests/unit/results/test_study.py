@@ -437,8 +437,14 @@ def test_a_hypothesis_can_compare_stages(rng: np.random.Generator) -> None:
         for seed in range(5)
     ]
     one = with_plan((), plan("stage = music better than stage = her", stage="music"), 5)
-    (claim,) = study_of(sweep_of(runs, one)).planned
+    study = study_of(sweep_of(runs, one))
+    (claim,) = study.planned
     assert claim.confirmed is True
+    assert [mean.condition.label for mean in study.means] == [
+        "q = 1, stage = her",
+        "q = 1, stage = music",
+    ]
+    assert study.unplanned == ()
 
 
 @pytest.mark.parametrize(
