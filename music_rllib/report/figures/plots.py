@@ -12,7 +12,7 @@ import functools
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import cycle, islice
+from itertools import cycle, product
 from typing import Literal, NamedTuple
 
 import matplotlib as mpl
@@ -46,7 +46,7 @@ _OF_EQUAL_Q = (
     "#e0529c",
     "#7a8a00",
     _UNKNOWN,
-    "#9a4dd6",
+    "#a066e0",
 )
 """Colors of conditions that differ in other settings than q, after the color of their q."""
 _MARKERS = "osD^vPX"
@@ -97,22 +97,31 @@ def marker_of(entropic_index: str) -> str:
 @functools.cache
 def styles_of(conditions: tuple[Condition, ...]) -> Mapping[Condition, Style]:
     """Styles of conditions: color and marker by q, other markers and dashes for similar colors."""
+    if len({condition.entropic_index for condition in conditions}) == 1:
+        return _styles_of_equal_q(conditions)
     styles: dict[Condition, Style] = {}
-    colors = [color_of(condition.entropic_index) for condition in conditions]
-    same_q = len({condition.entropic_index for condition in conditions}) == 1
-    if same_q:
-        others = [color for color in _OF_EQUAL_Q if not _are_alike(color, colors[0])]
-        colors = list(islice(cycle([colors[0], *others]), len(colors)))
-    for condition, color in zip(conditions, colors, strict=True):
-        marker = marker_of(condition.entropic_index)
-        alike = [style for style in styles.values() if same_q or _are_alike(color, style.color)]
-        taken = {style.marker for style in alike}
-        first = _MARKERS.find(marker)
-        turned = (_MARKERS[(first + turn) % len(_MARKERS)] for turn in range(1, len(_MARKERS)))
-        marker = next((free for free in (marker, *turned) if free not in taken), marker)
-        turn = len(alike) // len(_MARKERS) if same_q else len(alike)
-        styles[condition] = Style(color, marker, _DASHES[turn % len(_DASHES)])
+    for condition in conditions:
+        color, marker = color_of(condition.entropic_index), marker_of(condition.entropic_index)
+        alike = [style for style in styles.values() if _are_alike(color, style.color)]
+        first, taken = _MARKERS.find(marker), {style.marker for style in alike}
+        others = (_MARKERS[(first + turn) % len(_MARKERS)] for turn in range(1, len(_MARKERS)))
+        marker = next((free for free in (marker, *others) if free not in taken), marker)
+        styles[condition] = Style(color, marker, _DASHES[len(alike) % len(_DASHES)])
     return styles
+
+
+def _styles_of_equal_q(conditions: Sequence[Condition]) -> Mapping[Condition, Style]:
+    """The first condition has the color and marker of its q, each other one has its own."""
+    index = conditions[0].entropic_index
+    of_q, marker = color_of(index), marker_of(index)
+    first = _MARKERS.find(marker)
+    colors = [of_q, *(color for color in _OF_EQUAL_Q if not _are_alike(color, of_q))]
+    markers = dict.fromkeys((marker, *_MARKERS[first:], *_MARKERS[:first]))
+    rounds = product(_DASHES, markers)
+    return {
+        condition: Style(color, marker, dashes)
+        for condition, color, (dashes, marker) in zip(conditions, cycle(colors), cycle(rounds))
+    }
 
 
 def _are_alike(one: str, other: str) -> bool:
