@@ -9,6 +9,7 @@ import os
 import shutil
 import socket
 import tempfile
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -32,6 +33,8 @@ SOCKET_BYTES = 107
 """Maximum length of a UNIX socket's path on Linux."""
 LOCK = "lock"
 """File in a folder of `own_folder`, which its process has locked."""
+LEFT_SECONDS = 6 * 3600
+"""Age at which a local Ray's folder without a lock may be removed; a living Ray writes to it."""
 RAY_FOLDER = "mr-"
 """Prefix of a local Ray's folder."""
 LONGEST_SOCKET = len(
@@ -114,12 +117,28 @@ def own_folder(prefix: str, parent: Path | None = None) -> Iterator[str]:
 
 def _remove_if_left(folder: Path) -> None:
     """Remove a folder of `own_folder` if its process has ended."""
-    with contextlib.suppress(OSError):  # no folder with a lock, or its process lives
+    with contextlib.suppress(OSError, ValueError):  # another kind of folder, or its process lives
         if folder.is_symlink() or folder.stat().st_uid != os.getuid():
+            return
+        if _is_left_by_ray(folder):
+            shutil.rmtree(folder, ignore_errors=True)
             return
         with (folder / LOCK).open() as lock:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             shutil.rmtree(folder, ignore_errors=True)
+
+
+def _is_left_by_ray(folder: Path) -> bool:
+    """Whether a dying Ray created its removed folder again, without a lock, hours ago.
+
+    A session's name ends with the id of the driver's process.
+    """
+    sessions = {*folder.glob("r/session_*")}
+    if not sessions or {*folder.glob("*"), *folder.glob("r/*")} != {folder / "r", *sessions}:
+        return False
+    changed = max(path.lstat().st_mtime for path in folder.rglob("*"))
+    drivers = [int(path.name.rpartition("_")[2]) for path in sessions if not path.is_symlink()]
+    return time.time() - changed > LEFT_SECONDS and not any(map(psutil.pid_exists, drivers))
 
 
 def check_cpus(resources: Resources) -> int | None:

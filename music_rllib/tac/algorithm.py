@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
 import sys
-import tempfile
 import time
-import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
@@ -39,6 +36,7 @@ from music_rllib.envs.values import BadNumberError
 from music_rllib.intrinsic.relabeling import reward_class
 from music_rllib.replay.buffer import TrajectoryReplay
 from music_rllib.replay.trajectories import Floats, WholeTrajectories
+from music_rllib.runtime.machine import own_folder
 from music_rllib.schedules import value_at
 from music_rllib.tac.config import AlgorithmSettings, TACConfigBase
 from music_rllib.tac.env_runner import SUCCESS_LAST, TrajectoryEnvRunner, seed_or_entropy
@@ -123,15 +121,13 @@ class TAC(Algorithm):
         if self._storage is not None:
             super()._setup_logdir()
         else:
-            self._logdir = tempfile.mkdtemp(prefix="tac-")
-            self._remove_logdir = weakref.finalize(
-                self, shutil.rmtree, self._logdir, ignore_errors=True
-            )
+            self._files = contextlib.ExitStack()
+            self._logdir = self._files.enter_context(own_folder("music-tac-"))
 
     def cleanup(self) -> None:
         super().cleanup()
         if self._storage is None:  # now, because workers of Ray skip the interpreter's finalizers
-            self._remove_logdir()
+            self._files.close()
 
     # -- one step of the algorithm --------------------------------------------------------
 

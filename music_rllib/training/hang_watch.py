@@ -18,7 +18,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from tempfile import mkdtemp
 
 RECORD = "hung.txt"
 """File in a run's work folder: the attempt, the seconds that it hung, and the stack."""
@@ -49,9 +48,11 @@ class HangWatch:
         import faulthandler
 
         from music_rllib.envs.make import in_environment
+        from music_rllib.runtime.machine import own_folder
 
         self._calls = in_environment
-        folder = Path(mkdtemp(prefix="music-hang-"))  # the watching process removes it
+        self._files = contextlib.ExitStack()
+        folder = Path(self._files.enter_context(own_folder("music-hang-")))
         calls, stack = folder / "calls", folder / "stack"
         self._calls.share(calls)
         self._stack = stack.open("w")
@@ -81,6 +82,7 @@ class HangWatch:
         self._calls.unshare()
         faulthandler.unregister(signal.SIGUSR2)
         self._stack.close()
+        self._files.close()
 
 
 def check_hung(record: str | None, attempt: str, what: str) -> None:

@@ -101,10 +101,17 @@ def test_slow_calls_and_updates_are_not_hangs(what: str, tmp_path: Path) -> None
 
 
 def test_a_worker_that_is_killed_leaves_nothing_behind(tmp_path: Path) -> None:
-    with worker(tmp_path, "works") as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "watched\n"
-        process.kill()
+    """If its watching process is killed, too, then at the next start."""
+    for watching_too in (True, False):
+        with worker(tmp_path, "works") as process:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "watched\n"
+            if watching_too:
+                (watching,) = psutil.Process(process.pid).children()
+                watching.kill()
+            process.kill()
+        if watching_too:
+            assert len([*temporary_folder(tmp_path).iterdir()]) == 1
     assert leaves_nothing_behind(tmp_path)
 
 

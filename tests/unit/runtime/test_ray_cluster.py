@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 from typing import Any
 
@@ -85,6 +86,35 @@ def test_folders_of_killed_processes_are_removed_at_the_next_start(tmp_path: Pat
         assert Path(first).stat().st_mode & 0o777 == 0o700
     assert {*tmp_path.iterdir()} == {*kept}
     assert (elsewhere / "file").exists()
+
+
+NEVER = 4_194_304
+"""One more than Linux's largest id of a process."""
+
+
+@pytest.mark.parametrize(
+    ("file", "process", "hours", "removed"),
+    [
+        ("logs/x", NEVER, 7, True),
+        ("logs/x", NEVER, 5, False),
+        ("logs/x", os.getpid(), 7, False),
+        ("../../notes", NEVER, 7, False),
+        ("../notes", NEVER, 7, False),
+    ],
+)
+def test_a_folder_that_a_dying_ray_makes_again_is_removed_hours_later(
+    file: str, process: int, hours: int, removed: bool, tmp_path: Path
+) -> None:
+    """It has no lock. Its process has ended, and nothing else is in it."""
+    session = tmp_path / "mr-0_a1b2c3" / "r" / f"session_2026-11-26_23-29-15_979549_{process}"
+    (session / "logs").mkdir(parents=True)
+    (session / file).touch()
+    (session.parent / "session_latest").symlink_to(session)
+    then = time.time() - 3600 * hours
+    for path in (folder := session.parents[1]).rglob("*"):
+        os.utime(path, (then, then), follow_symlinks=False)
+    with own_folder("mr-", tmp_path):
+        assert folder.exists() != removed
 
 
 @pytest.mark.parametrize(
