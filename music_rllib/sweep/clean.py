@@ -13,7 +13,7 @@ from music_rllib.errors import BadInputError
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.sweep_files import SweepLocation, sweeps_in
 from music_rllib.redaction import redact
-from music_rllib.store.lease import Lease
+from music_rllib.store.lease import Lease, LeaseFile
 from music_rllib.store.node_store import CONTINUATIONS
 from music_rllib.store.sealed import MANIFEST
 from music_rllib.store.storage import StorageFolder, is_remote, open_storage, sweep_folder
@@ -30,16 +30,18 @@ class Cleaning:
 
     storage: StorageFolder
     folders: list[StorageFolder] = field(default_factory=list)
-    """Folders to delete, in the storage or on this machine."""
+    """Folders of runs to delete."""
+    own: list[StorageFolder] = field(default_factory=list)
+    """The sweep's own folders to delete afterwards, in the storage or on this machine."""
     items: list[Item] = field(default_factory=list)
-    """A description of each of them."""
+    """A description of each folder to delete."""
     kept: list[Item] = field(default_factory=list)
     """Folders that one might expect to be deleted, and why they are kept."""
-    begun: list[WorkFolder] = field(default_factory=list)
-    """Those of them that have a lease."""
+    leases: dict[str, LeaseFile] = field(default_factory=dict)
+    """Path of each folder that has a lease, to the lease."""
 
-    def add(self, folder: StorageFolder, what: str) -> None:
-        self.folders.append(folder)
+    def add(self, folder: StorageFolder, what: str, *, own: bool = False) -> None:
+        (self.own if own else self.folders).append(folder)
         self.items.append({"path": folder.path, "what": what})
 
     def keep(self, path: str, what: str) -> None:
@@ -49,22 +51,31 @@ class Cleaning:
         """Delete the folders, each run's manifest first: without it, the run is not finished.
 
         Raises:
-            BadInputError: Another process computes one of the runs; nothing was deleted.
+            BadInputError: Another process computes a run. Nothing was deleted, or if it started
+                just now, neither this run's checkpoints nor the sweep's own files.
         """
-        mine, files = Lease.of_this_process("clean"), [work.lease for work in self.begun]
-        # Together, since each takes seconds in a bucket, and a lease lasts a minute.
-        found = self.storage.map(lambda file: file.acquire(mine), files)
-        holders = [holder for holder in found if holder is not None]
-        if holders:
-            for file in files:
-                file.release(mine.owner)
-            raise BadInputError(
-                f"SWEEP must have no run that another process computes to be cleaned, got "
-                f"{holders[0]}: stop it, or wait for a minute after its end"
-            )
-        for folder in self.folders:
+        _refuse(self.storage.map(LeaseFile.holder, self.leases.values()))
+        _refuse(self.storage.map(self._delete, self.folders))
+        for folder in self.own:
+            folder.delete()
+
+    def _delete(self, folder: StorageFolder) -> Lease | None:
+        """Delete the folder of a run, or return the lease of another process."""
+        # Acquired only now, as a lease is short, and acquiring one in a bucket takes seconds.
+        lease = self.leases.get(folder.path)
+        holder = None if lease is None else lease.acquire(Lease.of_this_process("clean"))
+        if holder is None:
             folder.remove(MANIFEST)
             folder.delete()
+        return holder
+
+
+def _refuse(holders: Iterable[Lease | None]) -> None:
+    if found := [holder for holder in holders if holder is not None]:
+        raise BadInputError(
+            f"SWEEP must have no run that another process computes to be cleaned, got {found[0]}: "
+            "stop it, or wait for a minute after its end"
+        )
 
 
 def find_deletable(location: SweepLocation, *, unfinished: bool, everything: bool) -> Cleaning:
@@ -104,8 +115,9 @@ def find_deletable(location: SweepLocation, *, unfinished: bool, everything: boo
             if key not in finished and key not in pruned:
                 why = "interrupted"
             if why != "interrupted" or unfinished:
-                cleaning.begun.append(WorkFolder(storage / "work" / key))
-                cleaning.add(storage / "work" / key, f"checkpoints of {label}: {why}")
+                work = WorkFolder(storage / "work" / key)
+                cleaning.leases[work.folder.path] = work.lease
+                cleaning.add(work.folder, f"checkpoints of {label}: {why}")
         if key in finished and (last := node.get("continuation")) in continued:
             folder, what = storage / CONTINUATIONS / last, f"last checkpoint of {label}"
             if last in users:
@@ -120,12 +132,12 @@ def find_deletable(location: SweepLocation, *, unfinished: bool, everything: boo
 
 
 def _add_own_files(location: SweepLocation, storage: StorageFolder, cleaning: Cleaning) -> None:
-    cleaning.add(storage / location.name, "the sweep's own files")
+    cleaning.add(storage / location.name, "the sweep's own files", own=True)
     here = sweep_folder(location.storage, location.name)
     if is_remote(location.storage) and here.is_dir():
         # They include a study, which the next sweep of this name would use as its own.
         folder = StorageFolder(pafs.LocalFileSystem(), str(here))
-        cleaning.add(folder, "the sweep's own files on this machine")
+        cleaning.add(folder, "the sweep's own files on this machine", own=True)
     for database, study in _studies(location):
         what = f"study {study!r}: delete it with Optuna's tools if it is not needed"
         cleaning.keep(redact(database), what)

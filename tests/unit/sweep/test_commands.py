@@ -11,8 +11,10 @@ import shutil
 import signal
 import subprocess
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -51,7 +53,7 @@ from music_rllib.store import node_store
 from music_rllib.store import storage as storage_module
 from music_rllib.store.handoff import write_handoff
 from music_rllib.store.history import HISTORY, Report, RunResult, to_json_lines
-from music_rllib.store.lease import Lease
+from music_rllib.store.lease import Lease, LeaseFile
 from music_rllib.store.storage import DamagedError, StorageFolder
 from music_rllib.sweep import clean, driver, driver_lock, execution
 from music_rllib.sweep.export import sweep_of_run
@@ -457,6 +459,54 @@ def test_clean_deletes_nothing_if_another_process_computes_a_run(
     second.lease.release(theirs.owner)
     assert program("clean", f"{storage}/mine", "--all", "--yes").code == 0
     assert not sweep.store.begun()
+
+
+@pytest.mark.parametrize("storage", ["bucket"], indirect=True)
+@pytest.mark.parametrize("taken", [[], [4]])
+def test_clean_holds_the_lease_of_each_run_that_it_deletes(
+    taken: list[int],
+    storage: str,
+    tmp_path: Path,
+    program: Program,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Also if a lease expires before the last is acquired, and if a worker starts meanwhile."""
+    sweep = played(storage, tmp_path, runs=0)
+    works = [sweep.store.work_folder(node.key) for node in sweep.plan.nodes]
+    for work in works:
+        with work.new_checkpoint(400) as new:
+            (new.folder / "x").touch()
+    theirs = Lease.of_this_process("sweep 'other'").model_dump_json().encode()
+    deleted = []
+
+    def delete(folder: StorageFolder, name: str = "") -> None:
+        lease = LeaseFile(folder, "lease.json").read()
+        if folder.path in {work.folder.path for work in works} and not name:
+            assert lease is not None
+            assert (lease.what, lease.holds()) == ("clean", True)
+            deleted.append(folder.path)
+        really_delete(folder, name)
+
+    def settle(seconds: float) -> None:
+        for work in (works[number] for number in taken):
+            if work.lease.read() is not None:
+                work.folder.write("lease.json", theirs)
+        really_sleep(seconds)
+
+    really_delete, really_sleep = StorageFolder.delete, time.sleep
+    monkeypatch.setattr(StorageFolder, "delete", delete)
+    monkeypatch.setattr(lease_module, "time", SimpleNamespace(**vars(time) | {"sleep": settle}))
+    monkeypatch.setattr(lease_module, "SETTLE_SECONDS", 0.1)
+    monkeypatch.setattr(lease_module, "EXPIRES_SECONDS", 0.8)
+    monkeypatch.setattr(storage_module, "REQUESTS", 1)
+    said = program("clean", f"{storage}/mine", "--all", "--yes")
+    assert len(deleted) == len(works) - len(taken)
+    assert {*sweep.store.begun()} == {sweep.plan.nodes[number].key for number in taken}
+    if taken:
+        assert (said.code, "got sweep 'other' (process" in said.errors) == (2, True)
+        assert program("status", f"{storage}/mine").code == 0
+    else:
+        assert said.code == 0
 
 
 @pytest.mark.parametrize("storage", ["bucket"], indirect=True)
