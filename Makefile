@@ -10,7 +10,7 @@ PYTEST_ARGS ?=
 SECONDS ?= 600
 SEED    ?= 0
 # The tests of a file stay together and share what they set up; tests/conftest.py orders the files.
-# Three keep two cores busy, because sweeps wait for their processes; quick tests wait for nothing.
+# Three keep two cores busy, because sweeps wait for their processes. Unit tests do not wait.
 JOBS   ?= 3
 PYTEST = $(BIN)/python -m pytest -n $(JOBS) --dist loadscope --no-loadscope-reorder
 
@@ -25,17 +25,17 @@ help:  ## list the targets
 	@echo "  PYTHON=python3.12    the interpreter for the virtual environment (>= 3.11)"
 	@echo "  CONFIG=my.yaml       another sweep for 'make sweep'"
 	@echo "  PYTEST_ARGS='-k q'   more arguments for pytest"
-	@echo "  JOBS=4               so many tests at a time (default $(JOBS); each may use two cores)"
+	@echo "  JOBS=4               number of simultaneous tests (default $(JOBS); each may use two cores)"
 
 venv: $(STAMP)  ## create .venv and install everything, once
 
-# torch goes first and alone: with its exact version in place the second, much larger resolution
-# cannot wander to another build of it, each of which is a download of gigabytes.
+# Install torch first: with its exact version in place, the second, much larger resolution cannot
+# try other builds of it, each of which is a download of gigabytes.
 $(STAMP): pyproject.toml constraints.txt
 	@command -v "$(PYTHON)" >/dev/null || \
-	  { echo "There is no '$(PYTHON)' here. Install Python >= 3.11, or say 'make PYTHON=/path/to/python'." >&2; exit 1; }
+	  { echo "'$(PYTHON)' was not found. Install Python >= 3.11, or run 'make PYTHON=/path/to/python'." >&2; exit 1; }
 	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
-	  { echo "music_rllib needs Python >= 3.11; '$(PYTHON)' is $$("$(PYTHON)" -V 2>&1). Say 'make PYTHON=/path/to/python'." >&2; exit 1; }
+	  { echo "music_rllib needs Python >= 3.11; '$(PYTHON)' is $$("$(PYTHON)" -V 2>&1). Run 'make PYTHON=/path/to/python'." >&2; exit 1; }
 	@"$(PYTHON)" -c 'import venv, ensurepip' 2>/dev/null || \
 	  { echo "'$(PYTHON)' has no venv module (on Debian and Ubuntu: apt-get install python3-venv)." >&2; exit 1; }
 	@echo "[1/4] creating $(VENV) with $$("$(PYTHON)" -V 2>&1)"
@@ -47,7 +47,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@echo "[4/4] compiling the updates of the packaged sweep (a minute)"
 	@folder=$$(mktemp -d); \
 	  $(BIN)/python -m music_rllib plan --measure --storage "$$folder" >/dev/null || \
-	  echo "They could not be compiled now: the first run does it." >&2; rm -rf "$$folder"
+	  echo "They could not be compiled now; the first run will compile them." >&2; rm -rf "$$folder"
 	@touch $@
 	@echo "$(VENV) is ready"
 
@@ -58,24 +58,24 @@ test: venv  ## run the whole suite (CI=true: a missing service is a failure, not
 	@$(PYTEST) $(PYTEST_ARGS)
 
 test-unit: JOBS = 2
-test-unit: venv  ## run the quick tests (about a minute)
+test-unit: venv  ## run the unit tests (about a minute)
 	@$(PYTEST) tests/unit $(PYTEST_ARGS)
 
-test-faults: venv  ## kill, fill, cut and corrupt, and compare with unbroken runs (a quarter of an hour)
+test-faults: venv  ## inject faults and compare with uninterrupted runs (15 minutes)
 	@$(PYTEST) -m 'faults or thorough' $(PYTEST_ARGS)
 
 fuzz: venv  ## change policies, exports and YAML at random and read them (SECONDS=600 SEED=0)
 	@$(BIN)/python -m tests.fuzz --seconds $(SECONDS) --seed $(SEED)
 
-lint: venv  ## ruff: rules and formatting; import-linter: which room imports which
+lint: venv  ## check rules, formatting (ruff) and imports between sub-packages (import-linter)
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/lint-imports
 
-type: venv  ## mypy --strict
+type: venv  ## check types (mypy --strict)
 	@$(BIN)/mypy
 
-bench: venv  ## what everything costs, as ratios in one run (BENCH='step environment': some of it)
+bench: venv  ## measure all costs as ratios in one run (BENCH='step environment': some of them)
 	@$(BIN)/python -m pip install -qq -c constraints.txt -e '.[bench]'
 	@$(BIN)/python -m benchmarks $(BENCH)
 

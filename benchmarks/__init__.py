@@ -1,1 +1,1 @@
-"""Measurements, as ratios of things that run in turn in one process. Not part of the package."""
+"""Benchmarks: ratios of programs that run in turn in one process. Not part of the package."""

@@ -1,4 +1,4 @@
-"""`make bench`: every cost that a sweep consists of, as ratios measured in one run."""
+"""`make bench`: the costs of a sweep, as ratios measured in one run."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ pip install -e '.[bench]'. Targets count by wall and by CPU time; the latter is 
 
 
 def main() -> int:
-    """Measures, prints and writes the table."""
+    """Measure, print and write the table."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks",
         description=__doc__,
@@ -75,7 +75,7 @@ def main() -> int:
 
 
 def run(groups: Sequence[str], repeats: int, folder: Path) -> int:
-    """Measures the groups, one after the other; the files have what is measured so far."""
+    """Measure the groups one after the other; the files contain the rows measured so far."""
     rows: list[Row] = []
     before, code = os.getloadavg()[0], 0
     try:
@@ -101,7 +101,7 @@ def measure(name: str, repeats: int) -> Iterator[Row]:
 
     quiet_third_parties()
     torch.set_num_threads(1)
-    keep_freed_memory()  # what is compared with gets it too
+    keep_freed_memory()  # the compared programs get it too
     if not ray.is_initialized():
         start_ray(2)
     module: Any = importlib.import_module(f"benchmarks.{GROUPS[name]}")
@@ -116,7 +116,7 @@ def write(rows: list[Row], machine: dict[str, Any], folder: Path) -> None:
 
 
 def report(rows: list[Row], machine: dict[str, Any], folder: Path) -> None:
-    """Prints the table, what it says of the targets, and where it is."""
+    """Print the table, the missed targets, and the paths of the files."""
     from rich.console import Console
 
     console = Console(width=max(110, Console().width), highlight=False, soft_wrap=True)
@@ -170,7 +170,7 @@ def _ratio(median: float | None, low: float | None, high: float | None) -> tuple
 
 
 def as_table(rows: list[Row]) -> Table:
-    """For the screen."""
+    """The table for the terminal."""
     from rich.table import Table
 
     table = Table(title="medians over interleaved turns, one thread each")
@@ -183,7 +183,7 @@ def as_table(rows: list[Row]) -> Table:
 
 
 def as_markdown(rows: list[Row]) -> str:
-    """For the documentation."""
+    """The table for the documentation."""
     lines = ["| " + " | ".join(COLUMNS) + " |", "|" + "---|" * len(COLUMNS)]
     lines += ["| " + " | ".join(cells(row)) + " |" for row in rows]
     return "\n".join(lines) + "\n"

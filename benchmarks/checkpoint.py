@@ -1,4 +1,4 @@
-"""Checkpoints with 100,000 and a million transitions: the first, the next, and coming back."""
+"""Checkpoints with 100,000 and a million transitions: writing the first and the next, restoring."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def rows(repeats: int) -> Iterator[Row]:
 
 
 def turn(transitions: int) -> tuple[float, ...]:
-    """The first checkpoint writes the whole replay, the next one what 10,000 steps added."""
+    """The first checkpoint writes the whole replay, the next one only the last 10,000 steps."""
     with TemporaryDirectory() as folder, closing(TrainingRun(settings())) as training:
         work = NodeStore(folder).work_folder("0" * 20)
         replay = training.algorithm.replay

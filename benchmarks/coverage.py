@@ -1,10 +1,10 @@
-"""How often 95 % intervals of few seeds hold the truth, by simulation.
+"""Coverage of 95% intervals from few seeds, by simulation.
 
 python -m benchmarks.coverage [REPEATS]
 
-Seeds are drawn from a population of known mean; a rate is that of 20 or 50 evaluation episodes, so
-that its noise is in it. `music_rllib.results` makes the intervals, those of the mean of all repeats
-at once: as points of a curve, which have nothing to do with each other.
+Seeds are drawn from a population with a known mean. A rate is measured over 20 or 50 evaluation
+episodes, which adds their noise. `music_rllib.results` computes the intervals of all repeats in one
+call, as if they were independent points of a curve.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ SEEDS = (2, 3, 4, 5, 10, 20)
 
 @dataclass(frozen=True, kw_only=True)
 class Population:
-    """What seeds are drawn from."""
+    """Distribution of the seeds."""
 
     name: str
     draw: Callable[[np.random.Generator, tuple[int, ...]], Array]
     mean: float
     episodes: int | None = None
-    """None: no rate."""
+    """Number of evaluation episodes; None: not a rate."""
 
 
 def rates(a: float, b: float, episodes: int) -> Population:
-    """Success rates of seeds that are Beta(a, b), each seen through so many episodes."""
+    """Success rates of Beta(a, b) distributed seeds, each measured over this number of episodes."""
     return Population(
         name=f"rate, Beta({a:g}, {b:g}), {episodes} episodes",
         draw=lambda rng, shape: rng.binomial(episodes, rng.beta(a, b, shape)) / episodes,
@@ -53,7 +53,7 @@ POPULATIONS = (
     rates(200, 1, 50),
     rates(1, 9, 50),
 )
-"""Normal, and bounded ones that are the more skewed, the nearer they are to a bound."""
+"""Normal and bounded populations; the closer to a bound, the more skewed."""
 BEYOND = (
     Population(name="return, uniform", draw=lambda rng, shape: rng.uniform(-1, 1, shape), mean=0.0),
     Population(
@@ -62,16 +62,16 @@ BEYOND = (
     rates(20, 0.5, 50),
     rates(2, 0.2, 50),
 )
-"""Returns far from normal, and rates of which a few seeds are far below the rest: three seeds that
-are none of those can't know of them."""
+"""Returns far from normal, and rates with a few seeds far below the rest: a sample of three seeds
+without any of these cannot reveal them."""
 
 
 def coverage_of_the_mean(
     populations: Sequence[Population], seeds: int, repeats: int, rng: np.random.Generator
 ) -> tuple[float, float]:
-    """Share of intervals that hold the mean over the populations, and their median width.
+    """Share of intervals that contain the mean over the populations, and their median width.
 
-    Several populations are several tasks; all must be rates, or none.
+    Each population is a task. Either all of them are rates, or none is.
     """
     scores = np.stack([one.draw(rng, (seeds, repeats)) for one in populations], axis=1)
     found = st.estimate(scores, populations[0].episodes)
@@ -81,7 +81,7 @@ def coverage_of_the_mean(
 def coverage_of_the_gap(
     x: Population, y: Population, seeds: int, repeats: int, rng: np.random.Generator
 ) -> tuple[float, float]:
-    """The same of the difference between two conditions."""
+    """Coverage and median width for the difference between two conditions."""
     a, b = (st.estimate(one.draw(rng, (seeds, 1, repeats)), one.episodes) for one in (x, y))
     return _held(st.difference(a, b), x.mean - y.mean)
 
@@ -92,7 +92,7 @@ def _held(found: st.Estimate, truth: float) -> tuple[float, float]:
 
 
 def coverage_of_the_median(seeds: int, repeats: int, rng: np.random.Generator) -> float:
-    """The same of the median of the steps to a threshold, lognormal, cut off at a budget."""
+    """Coverage for the median of the steps to a threshold: lognormal, censored at a budget."""
     held, budget = 0, 1.5
     for _ in range(repeats):
         steps = rng.lognormal(size=seeds)
@@ -103,7 +103,7 @@ def coverage_of_the_median(seeds: int, repeats: int, rng: np.random.Generator) -
 
 
 def rows(repeats: int) -> Iterator[tuple[str, list[float]]]:
-    """What is measured, and its coverage for each number of `SEEDS`; NaN: no interval."""
+    """Name of a quantity, and its coverage for each number of `SEEDS`; NaN: no interval."""
     rng = np.random.default_rng(0)
     for one in (*POPULATIONS, *BEYOND):
         yield (
@@ -134,7 +134,7 @@ def rows(repeats: int) -> Iterator[tuple[str, list[float]]]:
 
 
 def main() -> None:
-    """Prints a Markdown table."""
+    """Print a Markdown table."""
     repeats = int(sys.argv[1]) if len(sys.argv) > 1 else 20_000
     print("| interval of | " + " | ".join(f"{seeds} seeds" for seeds in SEEDS) + " |")
     print("|---|" + "---|" * len(SEEDS))

@@ -2,7 +2,7 @@
 
 python -m benchmarks.decisions [DRAWS]
 
-Each setting draws paired differences of two conditions. Its rate is that of a decision at level
+Each setting draws paired differences of two conditions. Its rate is the rate of a decision at level
 0.05 for one comparison: a *difference* (superior or worse), or *equivalence* within 0.05. The first
 procedure is the one of `music_rllib.results.claims`; the others were candidates.
 """
@@ -25,7 +25,7 @@ MARGIN, COLLAPSE, RATE = 0.05, 0.45, 0.1
 """Margin of equivalence; depth of a collapse, and its chance for a seed."""
 Draw = Callable[[np.random.Generator, tuple[int, int]], Array]
 Test = Callable[[Array], tuple[Array, Array]]
-"""Differences `[seeds, draws]` to p-values of a difference and of equivalence, `[draws]`."""
+"""Maps differences `[seeds, draws]` to p-values of a difference and of equivalence, `[draws]`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +44,7 @@ def normal(mean: float, spread: float) -> Draw:
 
 
 def collapses(mean: float, *, both: bool = False) -> Draw:
-    """Differences with this mean, where one side, or each, collapses in one seed of ten."""
+    """Differences with this mean, where one side or both collapse in one seed of ten."""
 
     def draw(rng: np.random.Generator, shape: tuple[int, int]) -> Array:
         lost = (rng.random(shape) < RATE) - ((rng.random(shape) < RATE) * 1.0 if both else RATE)
@@ -60,7 +60,7 @@ def betas(rng: np.random.Generator, shape: tuple[int, int]) -> Array:
 
 
 def ceiling(rng: np.random.Generator, shape: tuple[int, int]) -> Array:
-    """Final rates over 50 episodes at the ceiling, where one seed of ten of a side has half."""
+    """Final rates over 50 episodes at the ceiling; on one side, one seed of ten has half of it."""
     x, y = rng.binomial(50, 0.99, (2, *shape)) / 50
     return np.asarray(np.where(rng.random(shape) < RATE, x - 0.5, x) - y)
 
@@ -93,7 +93,7 @@ def student(differences: Array) -> tuple[Array, Array]:
 
 
 def silent(differences: Array) -> tuple[Array, Array]:
-    """The same; a verdict that states which collapses it does not exclude counts as none."""
+    """The same, but a verdict that states which collapses it does not exclude is not counted."""
     found = contrast(differences, np.zeros_like(differences), paired=True, margin=MARGIN)
     assert found.p_equivalent is not None
     is_said = found.collapses >= COLLAPSES
@@ -177,7 +177,7 @@ def wrong_in_a_family(truths: Array, seeds: int, spread: float, draws: int) -> f
 
 
 def coverage(seeds: int, draws: int) -> float:
-    """Share of 95 % intervals of a mean that hold it, where one seed of ten collapses."""
+    """Share of 95% intervals that contain the mean, where one seed of ten collapses."""
     rng = np.random.default_rng(0)
     scores = 0.55 + collapses(0.0)(rng, (seeds, draws))
     found = st.estimate(scores[:, None], episodes=1000)

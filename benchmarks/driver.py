@@ -31,8 +31,8 @@ MOST_SECONDS, MOST_MEGABYTES = 0.15, 400
 
 
 def rows(_: int) -> Iterator[Row]:
-    """One sweep, whatever the number of repeats."""
-    ray.shutdown()  # the sweep brings its own
+    """One sweep, independent of the number of repeats."""
+    ray.shutdown()  # the sweep starts its own
     document = {
         "name": "many",
         "tasks": ["FetchReach"],

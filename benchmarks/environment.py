@@ -45,7 +45,7 @@ def stock_loop() -> Callable[[], None]:
 
 
 class Physics:
-    """Time that passes within `mj_step`, while it is in place of it."""
+    """Replaces `mj_step` and measures the time in it."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
@@ -58,7 +58,7 @@ class Physics:
 
 
 def share_of_physics(played: TrajectoryEnvRunner) -> float:
-    """Of the time of a call to `sample`, what `mj_step` takes: throughput against it alone."""
+    """Share of the time of a call to `sample` that `mj_step` takes: throughput relative to it."""
     physics = Physics()
     with mock.patch.object(mujoco, "mj_step", physics):
         begin = time.perf_counter()
@@ -67,7 +67,7 @@ def share_of_physics(played: TrajectoryEnvRunner) -> float:
 
 
 def rows(repeats: int) -> Iterator[Row]:
-    """For 1, 4, 8 and 16 sub-environments."""
+    """Rows for 1, 4, 8 and 16 sub-environments."""
     repeats *= 3  # a turn is short
     stock = stock_loop()
     for count in (1, 4, 8, 16):

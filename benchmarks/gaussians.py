@@ -18,7 +18,7 @@ from music_rllib.functional.mutual_information import time_permutations
 from music_rllib.intrinsic.estimator import MutualInformationEstimator
 
 HELD_OUT = (8, 20_000)
-"""Trajectories and frames that a trained estimator is judged on."""
+"""Trajectories and frames for the evaluation of a trained estimator."""
 
 
 def true_information(rho: float, dims: int) -> float:
@@ -83,7 +83,7 @@ def trained_bound(
 
 
 def main() -> None:
-    """Prints the table."""
+    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--bound", default="capped", help="music.bound (default capped)")
     parser.add_argument("--seeds", type=int, default=3, help="estimators per row (default 3)")

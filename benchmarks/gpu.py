@@ -1,4 +1,4 @@
-"""Updates on a GPU against the compiled ones on one core, and whole runs that share a GPU."""
+"""Updates on a GPU compared with compiled updates on one core, and runs that share a GPU."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ __all__ = ["rows"]
 
 GROUP = "GPU"
 ON_CPU = {(128, 256): 50, (256, 256): 50, (512, 512): 8, (512, 2048): 4, (1024, 2048): 2}
-"""Width of the three layers and batch, and the updates that a CPU does in a turn."""
+"""Width of the three layers, batch size, and updates per turn on a CPU."""
 RUNS: dict[tuple[int, int], tuple[int, ...]] = {(256, 256): (1, 8), (512, 2048): (8,)}
-"""Width and batch, and numbers of runs that train at once."""
+"""Width, batch size, and numbers of simultaneous runs."""
 
 
 def rows(repeats: int) -> Iterator[Row]:
-    """Nothing where PyTorch sees no GPU."""
+    """Rows of the GPU; none if PyTorch does not find one."""
     if not torch.cuda.is_available():
         print("PyTorch sees no NVIDIA GPU: not measured", file=sys.stderr)
         return

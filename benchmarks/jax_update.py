@@ -1,7 +1,7 @@
-"""The same TAC update in JAX, compiled as a whole: what leaving Python costs nothing looks like.
+"""The same TAC update in JAX, compiled as a whole: an update without any overhead of Python.
 
-Critics take the minibatch's and the policy's actions as two passes, whose weights' gradients XLA
-leaves out where none are asked for.
+Critics evaluate the minibatch's and the policy's actions in two passes. XLA skips the gradients of
+weights that are not used.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Any
 
-# Read when its CPU client is made; otherwise XLA takes every core.
+# JAX reads it when it creates its CPU client; otherwise XLA uses every core.
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
@@ -31,7 +31,7 @@ def jax_updates(
     inputs: int, actions: int, hidden: Sequence[int], batch: int, updates: int, *, q: float,
     alpha: float,
 ) -> Callable[[], None]:  # fmt: skip
-    """A turn of so many updates in one call, on data that lies ready in memory."""
+    """A turn of `updates` updates in one call, on data that is already in memory."""
     rng = np.random.default_rng(0)
 
     def network(first: int, last: int) -> Layers:

@@ -1,4 +1,4 @@
-"""Turns taken one after the other in one run, and the rows of the table that come of them."""
+"""Programs measured in turn in one run, and rows of the table computed from their times."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Taken(NamedTuple):
 
     wall: float
     cpu: float
-    """Of the process and of those that it waited for: two threads of a second take two."""
+    """CPU time of the process and its ended children, over all threads."""
 
 
 Turns = dict[str, list[Taken]]
@@ -46,24 +46,24 @@ class Row:
     """Median over the turns."""
     unit: str
     against: str = ""
-    """What `ratio` compares with; empty for a row that stands by itself."""
+    """The program that `ratio` compares with; empty if there is none."""
     ratio: float | None = None
-    """Median over the turns of ours to theirs: of times (smaller is better) or speeds (larger)."""
+    """Median over the turns of ours divided by theirs: times (smaller is better) or speeds."""
     low: float | None = None
     high: float | None = None
     """The smallest and the largest ratio of a turn."""
     cpu: float | None = None
-    """`value` by CPU time, where that was measured: on a shared machine wall time misleads."""
+    """`value` by CPU time, if measured: wall time is unreliable on a shared machine."""
     cpu_ratio: float | None = None
     cpu_low: float | None = None
     cpu_high: float | None = None
     target: str = ""
     met: bool | None = None
-    """Whether the target is met, by wall and by CPU time; None where there is none."""
+    """Whether the target is met, by wall and by CPU time; None without a target."""
 
 
 def start_ray(cpus: int, address: str = "local") -> None:
-    """A quiet Ray of this process's own, not one that happens to run; or the one at `address`."""
+    """Connect to a new local Ray with little output, or to the one at `address`."""
     import ray
 
     quiet: dict[str, Any] = {"logging_level": "error", "log_to_driver": False}
@@ -73,7 +73,7 @@ def start_ray(cpus: int, address: str = "local") -> None:
 
 
 def taken_by(turn: Callable[[], object]) -> Taken:
-    """Seconds of a turn of this process."""
+    """Time of a turn of this process."""
     wall, cpu = time.perf_counter(), _cpu_seconds()
     turn()
     return Taken(time.perf_counter() - wall, _cpu_seconds() - cpu)
@@ -85,7 +85,7 @@ def _cpu_seconds() -> float:
 
 
 def interleaved(turns: Mapping[str, Callable[[], object]], repeats: int) -> Turns:
-    """Times of all turns, in rounds: what disturbs the machine disturbs each alike."""
+    """Times of all turns, in rounds, so that a disturbance affects all programs alike."""
     for turn in turns.values():
         turn()  # the first one allocates
     taken: Turns = {name: [] for name in turns}
@@ -97,7 +97,7 @@ def interleaved(turns: Mapping[str, Callable[[], object]], repeats: int) -> Turn
 
 @contextlib.contextmanager
 def on_one_core() -> Iterator[None]:
-    """This process on one core: what would take more threads, XLA does, gets no others."""
+    """Run this process on one core, including XLA's threads."""
     cores = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(cores)})
     try:
@@ -107,7 +107,7 @@ def on_one_core() -> Iterator[None]:
 
 
 def told_turns(repeats: int) -> Iterator[int]:
-    """The turns' numbers; says which one begins, where a turn takes a minute and more."""
+    """Numbers of the turns; prints each, for turns that take a minute or more."""
     for turn in range(repeats):
         print(f"  turn {turn + 1} of {repeats}", file=sys.stderr, flush=True)
         yield turn
@@ -119,7 +119,7 @@ def middle(taken: Sequence[Taken]) -> Taken:
 
 
 def compared(over: Sequence[Taken], under: Sequence[Taken], factor: float = 1.0) -> dict[str, Any]:
-    """The ratios of two programs' turns, by wall and CPU time, as `ratio_row` takes them."""
+    """Ratios of two programs' turns, by wall and CPU time, as arguments of `ratio_row`."""
     pairs = list(zip(over, under, strict=True))
     return {
         "ratios": [factor * a.wall / b.wall for a, b in pairs],
@@ -140,7 +140,7 @@ def ratio_row(
     at_most: float | None = None,
     at_least: float | None = None,
 ) -> Row:
-    """A row of ratios, one a turn, and a target for their median, by wall and by CPU time."""
+    """A row for ratios of turns, with a target for their median, by wall and by CPU time."""
     medians = [statistics.median(measured) for measured in (ratios, cpu_ratios) if measured]
     target, met = "", None
     if at_most is not None:

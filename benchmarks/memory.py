@@ -19,7 +19,7 @@ LIMIT = 1.2
 
 
 def rows(repeats: int) -> Iterator[Row]:
-    """Resident memory at its highest: Ray's client, torch, networks, replay, a checkpoint."""
+    """Peak resident memory: Ray's client, torch, networks, replay, a checkpoint."""
     peak = statistics.median(peak_gigabytes() for _ in range(repeats))
     yield Row(
         "memory", f"one trial, {TRANSITIONS:,} transitions", peak, "GB",
@@ -28,7 +28,7 @@ def rows(repeats: int) -> Iterator[Row]:
 
 
 def peak_gigabytes() -> float:
-    """Of a trial's process, as it says itself."""
+    """Row of a trial's process, which reports its own memory."""
     finished = subprocess.run(
         [sys.executable, "-m", "benchmarks.memory"],
         stdout=subprocess.PIPE,
@@ -40,7 +40,7 @@ def peak_gigabytes() -> float:
 
 
 def main() -> None:
-    """Trains with a full replay for a while, saves, and prints the highest resident memory."""
+    """Train with a full replay for a while, save, and print the peak of resident memory."""
     from tempfile import TemporaryDirectory
 
     from benchmarks.checkpoint import save
@@ -56,7 +56,7 @@ def main() -> None:
     training.advance()
     with TemporaryDirectory() as folder:
         save(training, NodeStore(folder).work_folder("0" * 20), Path(folder), 1)
-    # Not `ru_maxrss`, which begins with what the parent process had.
+    # Not `ru_maxrss`, which starts at the peak of the parent process.
     status = Path("/proc/self/status").read_text()
     peak = int(status.split("VmHWM:")[1].split()[0]) * 1024 / 1e9
     print(json.dumps({"peak_gb": peak}))

@@ -1,8 +1,8 @@
 """One training program in a process of its own: `python -m benchmarks.peer NAME WIDTH RATIO`.
 
-WIDTH is that of its three hidden layers, RATIO its updates per environment step, 1 or 0.4. Reads
-seconds from its input, a line each; trains for at least so long, and answers with a line of JSON:
-the environment steps and the seconds they took.
+WIDTH is the width of its three hidden layers, RATIO its updates per environment step (1 or 0.4).
+Reads a number of seconds per line from its input, trains for at least this time, and prints one
+line of JSON: the environment steps and the elapsed seconds.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ ENV_ID = "FetchPush-v4"
 WARM_UP = 1_000
 BATCH = 256
 ENVIRONMENTS = 4
-"""Sub-environments of the programs that gain by several."""
+"""Sub-environments of the programs that are faster with several."""
 
 
 def ours(width: int, ratio: float) -> Callable[[], int]:
@@ -119,10 +119,9 @@ def sb3_sac(width: int, ratio: float) -> Callable[[], int]:
 
 
 def sbx_sac(width: int, ratio: float) -> Callable[[], int]:
-    """SBX, which is Stable-Baselines3 in JAX: SAC, with the HerReplayBuffer.
+    """SAC with HerReplayBuffer of SBX, which is Stable-Baselines3 in JAX.
 
-    It compiles all updates of a call into one, so that it gets those of four episodes at once, as
-    ours does.
+    It compiles all updates of a call into one, so a call has those of four episodes, as ours does.
     """
     import gymnasium as gym
     from sbx import SAC
@@ -155,7 +154,7 @@ def sbx_sac(width: int, ratio: float) -> Callable[[], int]:
 
 
 OFTEN = {1.0: (1, 1), 0.4: (5, 2)}
-"""By replay ratio: updates after so many environment steps, where an update is a call."""
+"""By replay ratio: environment steps and updates per call."""
 PEERS: dict[str, Callable[[int, float], Callable[[], int]]] = {
     "ours": ours,
     "RLlib SAC": functools.partial(rllib_sac, plain=False),
@@ -166,7 +165,7 @@ PEERS: dict[str, Callable[[int, float], Callable[[], int]]] = {
 
 
 def main() -> None:
-    """Warms up until learning has begun, and then serves turns."""
+    """Warm up until training has started, then serve turns."""
     prepare_environment()
     answers, sys.stdout = sys.stdout, sys.stderr
     import torch

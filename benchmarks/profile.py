@@ -17,7 +17,7 @@ examples:
 
 
 def main() -> int:
-    """Samples `benchmarks.peer`, which trains TAC with HER on FetchPush, 3 x 128."""
+    """Profile `benchmarks.peer`, which trains TAC with HER on FetchPush, 3 x 128."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.profile",
         description=__doc__,
@@ -38,7 +38,7 @@ def main() -> int:
 
 
 def record(py_spy: str, arguments: argparse.Namespace) -> int:
-    """Runs the training under py-spy, which follows it from its first line on."""
+    """Run the training under py-spy, which follows it from its first line on."""
     options = ["--output", str(arguments.output), "--format", arguments.format]
     if arguments.native:
         options.append("--native")

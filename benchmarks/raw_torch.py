@@ -1,7 +1,6 @@
-"""The same TAC update in bare torch: no RLlib, no replay. What the learner path is held against.
+"""The same TAC update in bare torch: no RLlib, no replay. The reference for the Learner's speed.
 
-Written at its best: batched critics, no critic gradients in the policy's step, fused Adam, one
-backward pass.
+Optimized: batched critics, no critic gradients in the policy's step, fused Adam, one backward pass.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ HIDDEN = (256, 256, 256)
 
 
 class RawUpdate:
-    """Five networks and their update on data that lies ready in memory."""
+    """Five networks and their update on data that is already in memory."""
 
     def __init__(self, inputs: int, actions: int, batch: int, *, q: float, alpha: float) -> None:
         torch.manual_seed(0)

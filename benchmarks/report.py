@@ -1,4 +1,4 @@
-"""A report on 500 runs with 500 points each, as a user makes it."""
+"""A report on 500 runs with 500 points each, written by the user's command."""
 
 from __future__ import annotations
 
@@ -51,10 +51,10 @@ stages:
     grid: {{tac.entropic_index: [1.0, 1.25, 1.5, 1.75, 2.0], tac.alpha: [.01, .02, .05, .1, .2]}}
 """
 PR_SET_CHILD_SUBREAPER = 36
-"""Linux's number for it."""
+"""Linux's constant of this name."""
 TARGET = 15.0
 OPENS, SIZE = 2.0, 8.0
-"""Seconds until Chromium has drawn the page, megabytes of it."""
+"""Seconds until Chromium has drawn the page, and the page's size in megabytes."""
 
 
 def rows(repeats: int) -> Iterator[Row]:
@@ -84,7 +84,7 @@ def _opened(chromium: str, address: str) -> Taken:
 
 
 def _run(command: Sequence[str]) -> None:
-    """Run a command until what it has started has ended too, whose CPU time is then known."""
+    """Run a command until its child processes have ended too, so that their CPU time is known."""
     ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
     own = psutil.Process()
     before = own.children()  # Ray, in `python -m benchmarks`
@@ -94,14 +94,14 @@ def _run(command: Sequence[str]) -> None:
 
 
 def config(storage: Path) -> SweepConfig:
-    """500 runs: 25 conditions on 20 seeds."""
+    """Plan of 500 runs: 25 conditions on 20 seeds."""
     file = storage / "large.yaml"
     file.write_text(CONFIG.format(seeds=", ".join(map(str, range(20)))))
     return load_config(file)
 
 
 def make_sweep(storage: Path) -> Path:
-    """The folder of a sweep whose curves climb, with noise."""
+    """The folder of a sweep with rising, noisy learning curves."""
     sweep, folder = config(storage), storage / "large"
     opened = open_sweep(sweep, make_plan(sweep), str(storage))
     keep_record(opened)

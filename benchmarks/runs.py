@@ -1,4 +1,4 @@
-"""Runs on FetchPush whose replay is filled with random trajectories, to weigh and to save."""
+"""Runs on FetchPush with a replay of random trajectories, for measurements of memory and size."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["fill", "settings"]
 
 
 def settings(env_steps: int = 10**6, seed: int = 0) -> RunSettings:
-    """TAC with HER as in the `small` preset's measure: 3 x 256 networks, 0.4 updates a step."""
+    """TAC with HER as measured for preset `small`: 3 x 256 networks, 0.4 updates per step."""
     return RunSettings.model_validate(
         {
             "task": BUILT_IN_TASKS["FetchPush"],
@@ -28,7 +28,7 @@ def settings(env_steps: int = 10**6, seed: int = 0) -> RunSettings:
 
 
 def fill(replay: TrajectoryReplay, transitions: int) -> None:
-    """Adds random trajectories until the replay holds so many transitions."""
+    """Add random trajectories until the replay holds `transitions` transitions."""
     rng = np.random.default_rng(0)
     some = [random_trajectory(rng) for _ in range(100)]
     while len(replay) < transitions:

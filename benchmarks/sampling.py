@@ -17,19 +17,19 @@ GROUP = "replay"
 LAYOUT = ReplayLayout(observation=25, action=4, goal=3, horizon=50)
 BATCH, CALLS, PER_CALL = 256, 4, 50
 Floats = NDArray[np.float32]
-FLAT = 1.5  # twenty times the data, out of memory instead of the cache
+FLAT = 1.5  # 20 times the data, from memory instead of the cache
 KINDS = ("uniform", "HER", "MUSIC-p")
 
 
 def random_trajectory(rng: np.random.Generator) -> Trajectory:
-    """An episode with the shapes of FetchPush's."""
+    """An episode with the shapes of FetchPush."""
     frames = rng.standard_normal((LAYOUT.horizon + 1, LAYOUT.frame), dtype=np.float32)
     actions = rng.uniform(-1, 1, (LAYOUT.horizon, LAYOUT.action)).astype(np.float32)
     return Trajectory(frames, actions, np.full(LAYOUT.horizon, -1.0, np.float32), False)
 
 
 def filled_replay(trajectories: int, kind: str = "uniform") -> TrajectoryReplay:
-    """A replay that is full with so many trajectories."""
+    """A replay with this number of trajectories."""
 
     def reward(achieved: Floats, desired: Floats) -> Floats:
         far = np.linalg.norm(achieved - desired, axis=-1) > 0.05
@@ -50,7 +50,7 @@ def filled_replay(trajectories: int, kind: str = "uniform") -> TrajectoryReplay:
 
 
 def minibatches(replay: TrajectoryReplay) -> Callable[[], None]:
-    """A turn of minibatches, drawn as in training: `PER_CALL` of them behind each other."""
+    """A turn of minibatches, drawn as in training: `PER_CALL` per call."""
 
     def turn() -> None:
         for _ in range(CALLS):
@@ -60,7 +60,7 @@ def minibatches(replay: TrajectoryReplay) -> Callable[[], None]:
 
 
 def rows(repeats: int) -> Iterator[Row]:
-    """Milliseconds a minibatch: flat in the replay's size, and -p near to uniform."""
+    """Milliseconds per minibatch: independent of the replay's size, and `-p` close to uniform."""
     sizes = (1_000, 10_000, 20_000)
     turns = {(kind, n): minibatches(filled_replay(n, kind)) for kind in KINDS for n in sizes}
     taken = interleaved({f"{kind} {n}": turn for (kind, n), turn in turns.items()}, repeats)
@@ -68,7 +68,7 @@ def rows(repeats: int) -> Iterator[Row]:
         times = taken[f"{kind} {n}"]
         value, cpu = (seconds / (CALLS * PER_CALL) * 1e3 for seconds in middle(times))
         what = f"{kind}, {n:,} trajectories"
-        if kind != "MUSIC-p" and n == min(sizes):  # what the others are compared with
+        if kind != "MUSIC-p" and n == min(sizes):  # reference of the other rows
             yield Row(GROUP, what, value, "ms/minibatch", cpu=cpu)
             continue
         if kind == "MUSIC-p":

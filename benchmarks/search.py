@@ -1,6 +1,6 @@
-"""A search of many tiny trials: whether the driver's memory and time per trial stay flat.
+"""A search of many tiny trials: are the driver's memory and time per trial constant?
 
-`python -m benchmarks.search 600` runs as many trials.
+`python -m benchmarks.search 600` runs 600 trials.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ __all__ = ["rows"]
 
 GROUP = "search"
 TRIALS, SETTLED, AT_A_TIME = 200, 40, 2
-"""Until `SETTLED` the driver imports and caches what it does once."""
+"""Number of trials after which the driver has imported and cached everything."""
 FLAT = 1.1
 LOOK_SECONDS = 1.0
 DOCUMENT: dict[str, Any] = {
@@ -61,7 +61,7 @@ DOCUMENT: dict[str, Any] = {
 
 
 class Look(NamedTuple):
-    """What a driver has used when so many trials were judged."""
+    """Resources that a driver has used after this number of completed trials."""
 
     trials: int
     seconds: float
@@ -70,11 +70,12 @@ class Look(NamedTuple):
 
 
 def rows(repeats: int, trials: int = TRIALS) -> Iterator[Row]:
-    """One round; 200 trials take some seven minutes."""
+    """Rows of one round; 200 trials take about seven minutes."""
     del repeats
-    ray.shutdown()  # the sweep brings its own
+    ray.shutdown()  # the sweep starts its own
     looks = watched_search(trials)
-    # After the last trials, which the state tells of a little later, come importances and report.
+    # After the last trial, seen slightly later in the state, it computes importances and the
+    # report.
     searching = [look for look in looks if SETTLED <= look.trials < trials - 2 * AT_A_TIME]
     begin, end = searching[0], searching[-1]
     passed = end.trials - begin.trials
@@ -100,7 +101,7 @@ def rows(repeats: int, trials: int = TRIALS) -> Iterator[Row]:
 
 
 def watched_search(trials: int) -> list[Look]:
-    """Look at a whole search's driver from outside."""
+    """Measure the driver of a whole search from another process."""
     document = copy.deepcopy(DOCUMENT)
     document["stages"][0]["search"]["trials"] = trials
     with TemporaryDirectory() as folder:
@@ -136,7 +137,7 @@ def _look(driver: psutil.Process, state: Path, begin: float) -> list[Look]:
 
 
 def main() -> None:
-    """Print the rows of a search with as many trials as are asked for."""
+    """Print the rows of a search with the given number of trials."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.search", description=__doc__)
     parser.add_argument("trials", nargs="?", type=int, default=TRIALS, help=f"default {TRIALS}")
     trials = parser.parse_args().trials

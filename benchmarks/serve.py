@@ -1,9 +1,10 @@
 """Load test of the served policy on loopback: requests per second and latencies.
 
-`python -m benchmarks.serve [POLICY]` starts the service as a user does, lets clients send
-observations one after the other without a pause, and compares every hundredth answer with the
-policy itself. Without POLICY the weights are random, which costs the same. `--storm N` sends N
-requests at once instead, beside as many that are never sent to their end.
+`python -m benchmarks.serve [POLICY]` starts the service as a user does. Clients send observations
+without pauses, and every 100th answer is compared with the policy. Without POLICY the weights are
+random, which costs the same.
+
+`--storm N` sends N requests at once, in parallel with N requests whose bodies never end. See
 `python -m benchmarks.serve --help`.
 """
 
@@ -36,26 +37,26 @@ from music_rllib.policy import Policy, PolicyNetwork, load_policy
 
 START_SECONDS = 120
 CHECKED = 100
-"""Every so many answers one is compared with the policy."""
+"""One of this many answers is compared with the policy."""
 
 
 @dataclass
 class Load:
-    """What one combination of clients and rows gave."""
+    """Result of one combination of clients and rows."""
 
     clients: int
     rows: int
     seconds: float = 0.0
     latencies: list[float] = field(default_factory=list)
-    """Seconds of each request that was answered with 200."""
+    """Duration of each request with status 200, in seconds."""
     errors: int = 0
     """Other statuses, and connections that broke."""
     wrong: int = 0
-    """Actions that are not the policy's."""
+    """Number of actions that differ from the policy's."""
 
 
 def random_policy(task: str = "FetchPush", hidden: int = 256) -> bytes:
-    """A policy's file with random weights, of the sizes of FetchPush."""
+    """A policy file with random weights and FetchPush's sizes."""
     rng = np.random.default_rng(0)
     observation, goal, action = 25, 3, 4
     sizes = [observation + goal, hidden, hidden, hidden, 2 * action]
@@ -85,7 +86,7 @@ def random_policy(task: str = "FetchPush", hidden: int = 256) -> bytes:
 
 @contextmanager
 def service(policy: str, replicas: int) -> Iterator[tuple[str, int]]:
-    """`music-rllib serve` on a free port of loopback; gives its URL and process id."""
+    """Run `music-rllib serve` on a free port of loopback; yields its URL and process id."""
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port = probe.getsockname()[1]
     arguments = ["--port", str(port), "--replicas", str(replicas)]
@@ -106,7 +107,7 @@ def service(policy: str, replicas: int) -> Iterator[tuple[str, int]]:
 
 
 async def measure(url: str, policy: Policy, load: Load, seconds: float) -> None:
-    """Let `load.clients` clients send requests for so long."""
+    """Let `load.clients` clients send requests for `seconds`."""
     began = time.perf_counter()
     until = began + seconds
     connector = aiohttp.TCPConnector(limit=load.clients)
@@ -147,26 +148,26 @@ async def _client(
 
 @dataclass
 class Storm:
-    """What many requests at once gave."""
+    """Result of many simultaneous requests."""
 
     answers: list[tuple[int, float]] = field(default_factory=list)
-    """Status and seconds of each request; 0 where the connection broke."""
+    """Status and seconds of each request; 0 if the connection broke."""
     healths: list[tuple[int, float]] = field(default_factory=list)
-    """The same of requests to Serve's own health check meanwhile, one after the other."""
+    """Status and seconds of each request to Serve's own health check meanwhile, one at a time."""
     without_retry: int = 0
-    """Answers 503 that don't say when to come again."""
+    """Number of answers 503 without a Retry-After header."""
 
     def quantile(self, share: float, *statuses: int) -> float:
-        """Of the seconds of answers with these statuses."""
+        """Seconds of the answers with these statuses."""
         return float(np.quantile([t for status, t in self.answers if status in statuses], share))
 
     def count(self, *statuses: int) -> int:
-        """Answers with these statuses."""
+        """Number of answers with these statuses."""
         return sum(status in statuses for status, _ in self.answers)
 
 
 async def storm(url: str, policy: Policy, count: int, token: str | None = None) -> Storm:
-    """Send `count` requests in parallel, each on a connection of its own."""
+    """Send `count` requests in parallel, each on its own connection."""
     seen = Storm()
     body = {"observation": [0.5] * policy.observation_size}
     if policy.goal_size:
@@ -204,7 +205,7 @@ async def storm(url: str, policy: Policy, count: int, token: str | None = None) 
 
 @contextmanager
 def half_sent(url: str, count: int) -> Iterator[list[socket.socket]]:
-    """So many requests whose bodies never end."""
+    """Send `count` requests whose bodies never end."""
     host, port = url.removeprefix("http://").split(":")
     head = f"POST /act HTTP/1.1\r\nHost: {host}\r\nContent-Length: 60000\r\n\r\n"
     with ExitStack() as stack:
@@ -225,7 +226,7 @@ def memory(service: int) -> float:
 
 
 def weather(url: str, policy: Policy, count: int, process: int) -> int:
-    """A storm, printed; 1 if anything but answers and polite refusals came of it."""
+    """Run and print a storm; 1 if an answer was neither a result nor a refusal with Retry-After."""
     before = memory(process)
     with half_sent(url, count):
         seen = asyncio.run(storm(url, policy, count))
@@ -233,11 +234,11 @@ def weather(url: str, policy: Policy, count: int, process: int) -> int:
         time.sleep(12)
     after = memory(process)
     again = asyncio.run(storm(url, policy, 1))
-    print(f"{count} requests at once beside {count} that are never sent to their end:")
+    print(f"{count} requests at once, in parallel with {count} whose bodies never end:")
     for status in (200, 503):
         if seen.count(status):
             shown = [f"{seen.quantile(share, status):.2f}" for share in (0.5, 0.99, 1)]
-            print(f"  {status}: {seen.count(status)}, median, 99 % and slowest s {shown}")
+            print(f"  {status}: {seen.count(status)}, median, 99% and slowest s {shown}")
     worst = max(seconds for _, seconds in seen.healths)
     print(f"  /-/healthz meanwhile: {len(seen.healths)} times, slowest {worst:.2f} s")
     print(f"  proxy and replica: {before:.0f} MB before, {during:.0f} during, {after:.0f} after")
@@ -247,7 +248,7 @@ def weather(url: str, policy: Policy, count: int, process: int) -> int:
 
 
 def table(loads: list[Load]) -> Table:
-    """One row per combination."""
+    """A table with a row per combination."""
     shown = Table("clients", "rows", "requests/s", "actions/s", "median ms", "95 %", "99 %", "bad")
     for load in loads:
         rate = len(load.latencies) / load.seconds

@@ -1,4 +1,4 @@
-"""A sweep of eight runs against the same runs without one, two at a time; a run's start-up."""
+"""A sweep of eight runs, two at a time, against the same runs without it; the start of a run."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 
 def rows(repeats: int) -> Iterator[Row]:
-    """A round of the eight runs takes minutes, of the start-up seconds."""
+    """A round of the eight runs takes minutes, a round of the start seconds."""
     yield from start_up(repeats)
-    ray.shutdown()  # the sweep brings its own
+    ray.shutdown()  # the sweep starts its own
     rounds = [(sweep(), bare_runs(), bare_runs(one_ray=True)) for _ in told_turns(repeats)]
     wholes, bares, sharing = zip(*rounds, strict=True)
     what = f"{RUNS} runs of {ENV_STEPS:,} steps"
@@ -46,7 +46,7 @@ def rows(repeats: int) -> Iterator[Row]:
 
 
 def sweep() -> float:
-    """Wall time of the whole program, its Ray and its MLflow store included."""
+    """Wall time of the whole program, including Ray and the MLflow store."""
     run = settings(ENV_STEPS)
     document = {
         "name": "bench",
@@ -68,9 +68,9 @@ def sweep() -> float:
 
 
 def bare_runs(*, one_ray: bool = False) -> float:
-    """Wall time of as many plain processes, each of which trains one run and nothing else.
+    """Wall time of the same number of plain processes, each of which only trains one run.
 
-    RLlib starts a Ray in each, unless all find `one_ray`, which is there before the clock starts.
+    RLlib starts a Ray in each process, unless all use `one_ray`, which is started before the clock.
     """
     address = []
     if one_ray:
@@ -97,7 +97,7 @@ def _wall_time(*arguments: str) -> float:
 
 
 class Starter:
-    """What a trial's process does until its first episode has been played."""
+    """Work of a trial's process until its first episode has been played."""
 
     def first_step(self) -> int:
         from music_rllib.training.run import TrainingRun
@@ -108,7 +108,7 @@ class Starter:
 
 
 def start_up(repeats: int) -> Iterator[Row]:
-    """From asking Ray for a process to the first environment steps."""
+    """Time from asking Ray for a process to the first environment steps."""
     actor = ray.remote(num_cpus=1)(Starter)
     taken = []
     for _ in range(repeats):
@@ -123,7 +123,7 @@ def start_up(repeats: int) -> Iterator[Row]:
 
 
 def train(seed: int, address: str = "local") -> None:
-    """One run without a sweep around it, with the Ray at `address` or its own."""
+    """One run without a sweep, with the Ray at `address` or its own."""
     from music_rllib.runtime.quiet import quiet_third_parties
     from music_rllib.training.run import TrainingRun
 

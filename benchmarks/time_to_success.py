@@ -28,9 +28,9 @@ __all__ = ["PROGRAMS", "rows"]
 
 SUCCESS, EPISODES, EVERY = 0.9, 50, 2_500
 LONGEST = 1_200.0
-"""CPU seconds for ours."""
+"""Limit of CPU seconds for ours."""
 FACTOR = 5.0
-"""The others get this many times ours."""
+"""Limit of the others, as a multiple of the CPU seconds of ours."""
 
 
 def rows(repeats: int) -> Iterator[Row]:
@@ -137,7 +137,7 @@ def sbx_tqc(seed: int, *, zoo: bool) -> tuple[Advance, Evaluate]:
     env = gym.make(ENV_ID)
 
     def advance() -> int:
-        # With the larger networks, a call of all steps would last longer than the limit.
+        # With the larger networks, a call with all steps would exceed the time limit.
         model.learn(200 if zoo else EVERY, reset_num_timesteps=False)
         return int(model.num_timesteps)
 

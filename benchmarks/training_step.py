@@ -1,4 +1,4 @@
-"""One training step (sampling, relabelling, update) against its products, bare torch and JAX."""
+"""One training step (sampling, relabeling, update) against matrix products, bare torch and JAX."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ __all__ = ["rows"]
 GROUP = "training step"
 UPDATES = 50
 ROUNDS = 3
-"""Of `repeats`: a turn takes a third of a second, and the machine's memory has slower minutes."""
+"""Factor on `repeats`: a turn takes only 0.3 s, and memory bandwidth varies over minutes."""
 BATCH, INPUTS, ACTIONS = 256, 28, 4
 HER: dict[str, Any] = {"hindsight_k": 4.0}
 SMALL: dict[str, Any] = HER | {"hidden_sizes": (128,) * 3}
@@ -48,7 +48,7 @@ CRITICS: dict[str, dict[str, Any]] = {
     "REDQ's 10 critics, policy delayed by 20": AVERAGED
     | {"critics": 10, "target_critics": 2, "policy_delay": 20},
 }
-"""Variants of 3 x 128 with other critics, held against their own products."""
+"""Variants of 3 x 128 with other critics, compared with their own matrix products."""
 VARIANTS |= {f"TAC, HER, 3 x 128, {name}": settings for name, settings in CRITICS.items()}
 PEERS: dict[str, tuple[str, float | None]] = {
     "TAC": ("raw torch", 1.0),
@@ -59,11 +59,11 @@ PEERS: dict[str, tuple[str, float | None]] = {
     "TAC, HER, 3 x 128, frozen estimator": ("TAC, HER, 3 x 128", 1.03),
     "TAC, HER, 3 x 128, trained estimator": ("TAC, HER, 3 x 128", 1.15),
 }
-"""What a variant's time is compared with, and the target."""
+"""Reference of a variant's time, and the target."""
 SIZES = {"TAC, HER": 256, "TAC, HER, 3 x 128": 128}
-"""Variants that are held against JAX and against their products, and the width of their layers."""
+"""Variants that are compared with JAX and matrix products, and the width of their layers."""
 OF_PRODUCTS = {128: 1.5, 256: 1.35}
-"""The target for their time as a multiple of their products', by width."""
+"""Target of their time as a multiple of the time of their matrix products, by width."""
 
 
 def algorithm(
@@ -75,7 +75,7 @@ def algorithm(
     played: int = 10_000,
     **training: Any,
 ) -> TAC:
-    """TAC on FetchPush, `played` transitions of random actions in its replay, the rest made up."""
+    """TAC on FetchPush with `played` transitions of random actions; the rest is random data."""
     config = TACConfig().environment("FetchPush-v4").env_runners(num_envs_per_env_runner=4)
     config.training(entropic_index=1.5, alpha=0.05, random_steps=10_000, **training)
     config.replay(capacity=transitions, hindsight_k=hindsight_k).debugging(seed=0)
@@ -97,7 +97,7 @@ def algorithm(
 
 
 def updates(algo: TAC, count: int = UPDATES) -> Callable[[], None]:
-    """A turn of `count` updates: sampling and relabelling, and the Learner's call."""
+    """A turn of `count` updates: sampling, relabeling, and the Learner's call."""
 
     def turn() -> None:
         drawn = algo.replay.sample_transitions(count * algo.config.settings.tac.batch_size)
@@ -165,10 +165,10 @@ def flops(
     critics: int = 2, target_critics: int | None = None, quantiles: int = 0,
     policy_critic: str = "min", policy_delay: int = 1,
 ) -> int:  # fmt: skip
-    """Multiplications and additions of all matrix products that one update needs.
+    """Multiplications and additions of all matrix products of one update.
 
-    An action of the policy has a gradient through its smallest critic only, unless their mean is
-    used.
+    An action of the policy has a gradient only through its smallest critic, unless the critics'
+    mean is used.
     """
 
     def layers(first: int, last: int) -> list[int]:
@@ -196,8 +196,8 @@ def flops(
 
 
 def rows(repeats: int) -> Iterator[Row]:
-    """Against bare torch, a JAX jit and the products at the best rate found, all in one run."""
-    with on_one_core():  # before threads are made that would know nothing of it
+    """Rows against bare torch, a JAX jit and the fastest matrix products, all in one run."""
+    with on_one_core():  # before threads are created, which would not inherit it
         taken = interleaved(_turns(), ROUNDS * repeats)
     for name in SIZES:
         yield from _against_the_best(name, taken)
@@ -229,7 +229,7 @@ def _against_the_best(name: str, taken: dict[str, list[Taken]]) -> Iterator[Row]
 def _against_own_products(
     name: str, settings: dict[str, Any], taken: dict[str, list[Taken]]
 ) -> Row:
-    """Against as many products at the best rate as its networks need."""
+    """A row against the matrix products of its networks at the highest rate found."""
     sizes = (INPUTS, ACTIONS, (128,) * 3, BATCH)
     of_networks = {k: v for k, v in settings.items() if k in (flops.__kwdefaults__ or {})}
     share = flops(*sizes, **of_networks) / flops(*sizes)
@@ -242,7 +242,7 @@ def _against_own_products(
 
 
 def _floor(width: int, taken: dict[str, list[Taken]]) -> str:
-    """The fastest products of a width."""
+    """The fastest matrix products of a width."""
     floors_of_it = [one for one in taken if one.endswith(f"{width} x {width}")]
     return min(floors_of_it, key=lambda one: middle(taken[one]).cpu)
 
@@ -258,7 +258,7 @@ def _row(
 
 
 def _rates(taken: list[Taken]) -> tuple[float, float]:
-    """Updates a second, and a CPU-second."""
+    """Updates per second, and per CPU second."""
     wall, cpu = middle(taken)
     return UPDATES / wall, UPDATES / cpu
 

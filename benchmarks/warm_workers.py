@@ -1,4 +1,4 @@
-"""Many short runs in a few worker processes against the same runs in a new process each."""
+"""Many short runs in a few worker processes, against a new process for each run."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["rows"]
 
 GROUP = "warm"
 VARIABLE = "BENCH_RUNS"
-"""Number of runs, for a quick look with fewer."""
+"""Environment variable with the number of runs, for a quick estimate from fewer."""
 ENV_STEPS, AT_A_TIME = 1_200, 2
 GROWTH = 1.05
 """Largest ratio of a worker's memory late in a sweep to its memory halfway."""
@@ -35,7 +35,7 @@ sys.exit(main(["run", *sys.argv[1:]]))
 
 
 def rows(repeats: int) -> Iterator[Row]:
-    """One round, whatever `repeats`: a round has many runs and takes minutes."""
+    """One round, independent of `repeats`: a round has many runs and takes minutes."""
     runs = int(os.environ.get(VARIABLE, "60"))
     cold, _ = sweep("cold", runs)
     warm, memory = sweep("warm", runs)

@@ -1,4 +1,4 @@
-"""Environment steps a second of a whole training, against what a user would take instead."""
+"""Environment steps per second of a whole training, compared with other libraries."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ __all__ = ["is_installed", "rows"]
 
 GROUP = "whole training"
 SECONDS = 10.0
-"""Of a turn. The slowest peer does some 60 environment steps in it."""
+"""Seconds of a turn. The slowest program makes about 60 environment steps in it."""
 OTHERS: dict[str, str] = {
     "RLlib SAC": "ray",
     "RLlib SAC, same networks": "ray",
     "SB3 SAC+HER": "stable_baselines3",
     "SBX SAC+HER": "sbx",
 }
-"""What ours is compared with, and the package that it takes."""
+"""Programs to compare with, and the package that each needs."""
 SETTINGS: dict[tuple[int, float], dict[str, float | None]] = {
     (128, 0.4): {"RLlib SAC, same networks": 15.0, "SB3 SAC+HER": 3.0, "SBX SAC+HER": 1.3},
     (128, 1.0): {"SB3 SAC+HER": None, "SBX SAC+HER": None},
@@ -35,7 +35,7 @@ SETTINGS: dict[tuple[int, float], dict[str, float | None]] = {
         "RLlib SAC": None, "RLlib SAC, same networks": 5.0, "SB3 SAC+HER": 1.7, "SBX SAC+HER": None,
     },
 }  # fmt: skip
-"""Width of the three layers and replay ratio (`small`'s first), and the targets of the ratios."""
+"""Width of the three layers and replay ratio (first those of preset `small`), and the targets."""
 
 
 class Peer:
@@ -52,11 +52,11 @@ class Peer:
         )
 
     def wait(self) -> None:
-        """Until its warm-up is over."""
+        """Wait until its warm-up is over."""
         self._answer()
 
     def turn(self) -> Taken:
-        """Seconds per environment step, by CPU time those of Ray's processes included."""
+        """Seconds per environment step; the CPU time includes Ray's processes."""
         assert self._process.stdin is not None
         before = self._cpu_seconds()
         self._process.stdin.write(f"{SECONDS}\n")
@@ -82,7 +82,7 @@ class Peer:
         return answer
 
     def stop(self) -> None:
-        """Ends the process."""
+        """End the process."""
         assert self._process.stdin is not None
         self._process.stdin.close()
         self._process.terminate()
@@ -127,5 +127,5 @@ def _row(
 
 
 def is_installed(package: str) -> bool:
-    """Whether a program to compare with is here."""
+    """Whether the program's package is installed."""
     return importlib.util.find_spec(package) is not None

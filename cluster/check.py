@@ -1,15 +1,14 @@
-"""Hold the files of this folder against their schemas, before anything is started with them.
+"""Check the files of this folder against their schemas, before using them.
 
     python cluster/check.py                      # all of them
     python cluster/check.py cluster/onprem.yaml  # one, for instance after a change
 
-The launcher's files are checked by the installed Ray itself (and node types by botocore, where
-that is installed), Serve's by Ray Serve, sweeps by this package, those of compose and Kubernetes
-by the schemas in `schemas/`. Of Prometheus, Grafana and kustomize only what they can't do without
-is looked at. What a schema can't say is checked too: addresses nobody has put in yet, ports open
-to the world, missing files.
+The installed Ray checks the launcher's files (and botocore, if installed, their node types), Ray
+Serve its own, this package sweeps, and the schemas in `schemas/` those of compose and Kubernetes.
+For Prometheus, Grafana and kustomize only required keys are checked. Other checks: placeholders of
+addresses, ports open to the world, missing files.
 
-Exit codes: 0 all is sound, 2 something isn't; one line per problem.
+Prints one line per problem. Exit codes: 0 no problem, 2 problems.
 """
 
 from __future__ import annotations
@@ -63,7 +62,7 @@ def strings(value: Any, place: str = "") -> Iterator[tuple[str, str]]:
 
 
 def check_placeholders(document: Any) -> Problems:
-    """Addresses that are to be replaced; nothing else in these files is a placeholder."""
+    """Addresses that the user must replace; these files have no other placeholders."""
     for place, text in strings(document):
         if re.search(r"\.invalid\b|CHANGE.?ME|<[a-z-]+>", text, re.IGNORECASE):
             yield f"{place}: must be replaced by a value of yours, got {text!r}"
@@ -73,17 +72,17 @@ def check_placeholders(document: Any) -> Problems:
 
 
 def check_launcher(document: dict[str, Any], _: Path) -> Problems:
-    """As `ray up` does before it reaches for any machine."""
+    """Check as `ray up` does before it connects to any machine."""
     from ray.autoscaler._private.util import prepare_config, validate_config
 
     logging.getLogger("ray.autoscaler._private.util").setLevel(logging.WARNING)
     yield from check_placeholders(document)
     try:
-        # Ray remarks on file mounts for containers, of which there are none here.
+        # Ray warns about file mounts for containers, which are not used here.
         with contextlib.redirect_stdout(None), contextlib.redirect_stderr(None):
             prepared = prepare_config(copy.deepcopy(document))
             validate_config(prepared)
-    except Exception as error:  # Ray's own kinds, those of jsonschema, and those of its own bugs
+    except Exception as error:  # Exceptions of Ray, of jsonschema, and of Ray's own bugs
         lines = str(error).strip().splitlines()
         yield lines[0] if lines and not isinstance(error, _ACCIDENTS) else _not_taken(error)
         return
@@ -100,7 +99,7 @@ def check_launcher(document: dict[str, Any], _: Path) -> Problems:
 
 
 _ACCIDENTS = (AttributeError, IndexError, KeyError, TypeError)
-"""What Ray raises where it relies on a key or a type that isn't there."""
+"""Exceptions of Ray where it relies on a key or a type that is missing."""
 
 
 def _not_taken(error: Exception) -> str:
@@ -108,7 +107,7 @@ def _not_taken(error: Exception) -> str:
 
 
 def _check_instances(node_types: dict[str, Any]) -> Problems:
-    """Against the service's own description of RunInstances."""
+    """Check against EC2's own description of RunInstances."""
     try:
         from botocore.loaders import Loader
         from botocore.model import ServiceModel
@@ -128,7 +127,7 @@ def _check_instances(node_types: dict[str, Any]) -> Problems:
 
 
 def check_compose(document: dict[str, Any], path: Path) -> Problems:
-    """The Compose Specification, and what it leaves open."""
+    """Check against the Compose Specification, and rules that it does not contain."""
     validator = jsonschema.Draft202012Validator(_schema("compose-spec.json"))
     problems = list(_violations(document, validator))
     yield from problems
@@ -142,7 +141,7 @@ def check_compose(document: dict[str, Any], path: Path) -> Problems:
                 yield f"services.{name}.ports: must be published on 127.0.0.1 only, got {port}"
         for volume in service.get("volumes", ()):
             kind, source = _source(volume)
-            # What is elsewhere on the machine may be another one's.
+            # Other places of the machine may belong to other programs.
             if kind == "bind" and source[:1] == "." and not (path.parent / source).exists():
                 yield f"services.{name}.volumes: {source} must exist"
             elif kind == "volume" and source not in volumes:
@@ -155,17 +154,17 @@ def check_compose(document: dict[str, Any], path: Path) -> Problems:
 
 
 def _on_loopback(port: Any) -> bool:
-    """Of the short form `127.0.0.1:8265:8265` or the long one with `host_ip`."""
+    """Accepts the short form `127.0.0.1:8265:8265` and the long one with `host_ip`."""
     if isinstance(port, dict):
         return port.get("host_ip") in ("127.0.0.1", "::1")
     return str(port).startswith(("127.0.0.1:", "[::1]:"))
 
 
 def _source(volume: Any) -> tuple[str, str]:
-    """Kind and source of what is mounted, in the short form or the long one.
+    """Kind and source of a mount, in the short form or the long one.
 
     The kind is `bind` for a file or folder of this machine, `volume` for a named volume, and
-    another one for what needs no source.
+    another one if a source is not needed.
     """
     if isinstance(volume, dict):
         source = str(volume.get("source", ""))
@@ -177,7 +176,7 @@ def _source(volume: Any) -> tuple[str, str]:
 
 
 def _check_build(name: str, build: Any, compose: Path) -> Problems:
-    """Whether the Dockerfile and its stage are there; of the short form `build: FOLDER` too."""
+    """Check that the Dockerfile and its stage exist, also for the short form `build: FOLDER`."""
     given = build if isinstance(build, dict) else {"context": build}
     place = f"services.{name}.build"
     if "dockerfile_inline" in given or "://" in str(given.get("context", "")):
@@ -206,9 +205,9 @@ def _cluster_schema() -> Any:
 
 
 def kuberay_validator() -> Any:
-    """For RayCluster and RayJob, pods included."""
+    """Check a RayCluster or RayJob, including its pods."""
     own, core = _cluster_schema(), _schema("kubernetes-1.34.json")
-    # Kubernetes itself takes any number and text for a start.
+    # Kubernetes itself accepts any number and text at first.
     core["definitions"][QUANTITY] = own["definitions"]["Quantity"]
     resource = DRAFT7.create_resource(core)
     registry: Registry[Any] = Registry().with_resource("kubernetes-1.34.json", resource)
@@ -237,7 +236,7 @@ CRD_FILES = {"RayCluster": "ray.io_rayclusters.yaml", "RayJob": "ray.io_rayjobs.
 
 
 def _check_secret(document: dict[str, Any]) -> Problems:
-    """KubeRay takes a Secret of the cluster's name for the one with its token."""
+    """KubeRay uses the Secret with the cluster's name for its token."""
     if document["kind"] != "RayCluster" or "secretName" in document["spec"].get("authOptions", {}):
         return
     name = document["metadata"]["name"]
@@ -247,7 +246,7 @@ def _check_secret(document: dict[str, Any]) -> Problems:
 
 
 def _check_groups(document: dict[str, Any]) -> Problems:
-    """What KubeRay's operator refuses, but no schema can say."""
+    """Check rules of KubeRay's operator that a schema cannot express."""
     place, spec = "spec", document["spec"]
     if document["kind"] == "RayJob":
         place, spec = "spec.rayClusterSpec", spec.get("rayClusterSpec", {})
@@ -271,13 +270,13 @@ def _check_groups(document: dict[str, Any]) -> Problems:
 _TOLD_APART_BY = {
     **dict.fromkeys(("containers", "initContainers", "volumes", "env"), ("name",)),
     "volumeMounts": ("mountPath",),
-    "ports": ("containerPort", "port", "protocol"),  # of containers, of services
+    "ports": ("containerPort", "port", "protocol"),  # ports of containers, ports of services
 }
 """Lists of a pod whose entries must differ in these keys."""
 
 
 def _check_twins(value: Any, place: str = "") -> Problems:
-    """What the API server refuses in lists that are maps to it."""
+    """Check rules of the API server for lists that it treats as maps."""
     if isinstance(value, list):
         for index, inner in enumerate(value):
             yield from _check_twins(inner, f"{place}.{index}")
@@ -328,7 +327,7 @@ def read_crds(folder: Path) -> Crds:
 
 
 class CrdError(ValueError):
-    """The folder of `--crds` hasn't what it must have."""
+    """The folder of `--crds` lacks a file or a field."""
 
 
 def _strict(schema: Any) -> Any:
@@ -343,7 +342,7 @@ def _strict(schema: Any) -> Any:
         strict = {"type": ["integer", "string"], **pattern}
     fields = strict.get("properties")
     if isinstance(fields, dict) and isinstance(strict.get("required"), list):
-        # Defaults are filled in before anything is checked.
+        # The API server fills in defaults first.
         given = [name for name in strict["required"] if "default" not in fields.get(name, {})]
         strict["required"] = given
     if "properties" in strict and "additionalProperties" not in strict:
@@ -353,7 +352,7 @@ def _strict(schema: Any) -> Any:
 
 
 def check_claim(document: dict[str, Any], _: Path) -> Problems:
-    """A PersistentVolumeClaim, the one kind of Kubernetes' own that is here."""
+    """Check a PersistentVolumeClaim, the only built-in kind of Kubernetes in these files."""
     kind = document.get("kind")
     if kind != "PersistentVolumeClaim":
         yield f"kind: must be PersistentVolumeClaim, RayCluster or RayJob, got {kind!r}"
@@ -365,7 +364,7 @@ def check_claim(document: dict[str, Any], _: Path) -> Problems:
 
 
 def _inlined(schema: dict[str, Any]) -> dict[str, Any]:
-    """Draft 7 ignores what stands beside a `$ref`."""
+    """Draft 7 ignores the keys next to a `$ref`."""
     return {"definitions": schema["definitions"], "allOf": [{"$ref": schema["$ref"]}]}
 
 
@@ -373,7 +372,7 @@ def _inlined(schema: dict[str, Any]) -> dict[str, Any]:
 
 
 def check_serve(document: dict[str, Any], _: Path) -> Problems:
-    """As `serve deploy` does, and the arguments as the application does."""
+    """Check as `serve deploy` does, and the arguments as the application does."""
     from pydantic import ValidationError
     from ray.serve.schema import ServeDeploySchema
 
@@ -381,7 +380,7 @@ def check_serve(document: dict[str, Any], _: Path) -> Problems:
 
     yield from check_placeholders(document)
     try:
-        # Serve itself takes unknown keys in silence, for later versions of itself.
+        # Serve itself ignores unknown keys, for compatibility with its later versions.
         known = ServeDeploySchema.model_validate(document).model_dump(exclude_unset=True)
         yield from _unknown(document, known)
     except ValidationError as error:
@@ -420,7 +419,7 @@ def _unknown(given: Any, known: Any, place: str = "") -> Problems:
 
 
 def check_sweep(_: dict[str, Any], path: Path) -> Problems:
-    """As `music-rllib run` does."""
+    """Check as `music-rllib run` does."""
     from music_rllib.config.load import load_config
     from music_rllib.config.problems import ConfigError
 
@@ -431,7 +430,7 @@ def check_sweep(_: dict[str, Any], path: Path) -> Problems:
 
 
 def check_prometheus(document: dict[str, Any], _: Path) -> Problems:
-    """Jobs by name and something to scrape; `promtool check config` knows the rest."""
+    """Check that jobs have names and targets; `promtool check config` checks the rest."""
     names = set()
     for index, job in enumerate(_mappings(document["scrape_configs"])):
         place = f"scrape_configs.{index}"
@@ -447,7 +446,7 @@ def check_prometheus(document: dict[str, Any], _: Path) -> Problems:
 
 
 def check_datasource(document: dict[str, Any], _: Path) -> Problems:
-    """Grafana's datasources: what each must have; Grafana says the rest in its log."""
+    """Check the required keys of Grafana's datasources; Grafana logs other errors."""
     if document.get("apiVersion") != 1:
         yield f"apiVersion: must be 1, got {document.get('apiVersion')!r}"
     for index, source in enumerate(_mappings(document["datasources"])):
@@ -460,7 +459,7 @@ def check_datasource(document: dict[str, Any], _: Path) -> Problems:
 
 
 def check_kustomization(document: dict[str, Any], path: Path, crds: Crds | None = None) -> Problems:
-    """The files that it puts together; `kubectl kustomize FOLDER` knows the rest."""
+    """Check the files that it combines; `kubectl kustomize FOLDER` checks the rest."""
     if not isinstance(document["resources"], list):
         yield "resources: must be a list"
         return
@@ -488,14 +487,14 @@ def _is_same(one: dict[str, Any], other: dict[str, Any]) -> bool:
 
 
 def _merged(document: Any, patch: Any) -> Any:
-    """As kustomize merges a patch into a custom resource."""
+    """Merge as kustomize merges a patch into a custom resource."""
     if not isinstance(document, dict) or not isinstance(patch, dict):
         return patch
     return document | {key: _merged(document.get(key), value) for key, value in patch.items()}
 
 
 def _mappings(entries: Any) -> list[dict[str, Any] | None]:
-    """The entries of a list; None for what is no mapping."""
+    """The entries of a list; None if an entry is not a mapping."""
     given = entries if isinstance(entries, list) else [entries]
     return [entry if isinstance(entry, dict) else None for entry in given]
 
@@ -504,7 +503,7 @@ def _mappings(entries: Any) -> list[dict[str, Any] | None]:
 
 
 def check_file(path: Path, crds: Crds | None = None) -> list[str]:
-    """What is wrong with one file; its content says what kind it is."""
+    """Problems of one file; its content determines its kind."""
     try:
         document = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
@@ -513,7 +512,7 @@ def check_file(path: Path, crds: Crds | None = None) -> list[str]:
 
 
 def check_document(document: Any, path: Path, crds: Crds | None = None) -> list[str]:
-    """The same of a file's content; paths in it are relative to `path`."""
+    """Problems of a file's content; paths in it are relative to `path`."""
     if not isinstance(document, dict):
         return ["must be a mapping"]
     if str(document.get("apiVersion")).startswith("ray.io/"):
@@ -536,7 +535,7 @@ KINDS: dict[str, Callable[..., Problems]] = {
     "resources": check_kustomization,
     "apiVersion": check_claim,
 }
-"""The first key that a file has says what it is: a sweep may have `resources` too."""
+"""Keys that identify a kind, first match first: a sweep may have `resources` too."""
 ALL = (
     "aws.yaml",
     "compose.yaml",
@@ -556,7 +555,7 @@ ALL = (
 
 
 def main() -> int:
-    """Check, and say what is wrong."""
+    """Check the files and print their problems."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

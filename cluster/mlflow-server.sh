@@ -1,11 +1,11 @@
 #!/bin/sh
-# MLflow with basic authentication. All that is secret comes from the environment:
+# MLflow with basic authentication. All secrets come from the environment:
 #   MLFLOW_BACKEND_STORE_URI        database of the runs, e.g. postgresql://mlflow:...@postgres/mlflow
 #   MLFLOW_AUTH_DATABASE_URI        database of the users (may be the same server's)
 #   MLFLOW_ADMIN_USERNAME, MLFLOW_ADMIN_PASSWORD   the first user; at least 12 characters
 #   MLFLOW_FLASK_SERVER_SECRET_KEY  signs forms; the same for all servers
 # and, optional: MLFLOW_HOST (127.0.0.1), MLFLOW_PORT (5000), MLFLOW_ARTIFACTS (./mlartifacts),
-# MLFLOW_SERVER_ALLOWED_HOSTS (names under which clients may speak to it).
+# MLFLOW_SERVER_ALLOWED_HOSTS (host names that clients may use).
 set -eu
 
 for name in MLFLOW_BACKEND_STORE_URI MLFLOW_AUTH_DATABASE_URI MLFLOW_ADMIN_USERNAME \
@@ -21,13 +21,13 @@ case "$MLFLOW_ADMIN_PASSWORD$MLFLOW_AUTH_DATABASE_URI" in
   *%*) percent=1 ;;
   *) percent=0 ;;
 esac
-# configparser reads the file and takes % for the beginning of a reference.
+# configparser reads the file; in it, % begins a reference.
 [ "$percent" = 0 ] || {
   echo "mlflow-server: MLFLOW_ADMIN_PASSWORD and MLFLOW_AUTH_DATABASE_URI must have no %" >&2
   exit 2
 }
 
-# SQLAlchemy 2.1 takes postgresql:// for psycopg 3, and what is installed is psycopg2.
+# SQLAlchemy 2.1 uses psycopg 3 for postgresql://, but psycopg2 is installed.
 for name in MLFLOW_BACKEND_STORE_URI MLFLOW_AUTH_DATABASE_URI; do
   eval "value=\$$name"
   case "$value" in
@@ -36,7 +36,7 @@ for name in MLFLOW_BACKEND_STORE_URI MLFLOW_AUTH_DATABASE_URI; do
 done
 
 # Without the cache every request hashes the password, which takes most of its time.
-# Readable for this user only, and gone when the server ends.
+# Readable for this user only, and removed when the server ends.
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT INT TERM
 umask 077

@@ -1,4 +1,4 @@
-"""What every test stands on: a fixed environment, the tiers' markers, services, a local Ray."""
+"""Basis of all tests: a fixed environment, markers of the tiers, services, a local Ray."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-# Before anything imports Ray, torch or MLflow: they read these while they are imported, and the
-# programs that tests start inherit them.
+# Before the imports of Ray, torch and MLflow, which read these variables. Programs that tests start
+# inherit them.
 os.environ.update(
     {
-        # Explicit, because Ray's default depends on what else was run on the machine before.
+        # Explicit, because Ray's default depends on earlier programs on the machine.
         "RAY_AUTH_MODE": "disabled",
-        # More threads change the sums' order and are slower on busy machines.
+        # More threads change the order of sums, and are slower on busy machines.
         "OMP_NUM_THREADS": "1",
         "NO_COLOR": "1",
-        # Seconds for each sweep; the test of it asks for it.
+        # It takes seconds per sweep; its own test enables it.
         "MUSIC_RLLIB_REPORT": "off",
         # Tests wait for the line of an evaluation.
         "MUSIC_RLLIB_PROGRESS": "all",
@@ -41,7 +41,7 @@ from music_rllib.runtime.quiet import (
 
 prepare_environment()
 quiet_third_parties()
-# Tests start clusters as well; each program of ours that they start decides for itself.
+# Tests start clusters as well; each program decides for itself.
 os.environ.pop(LOCAL_RAY_BEYOND_LOOPBACK)
 # Tests start modules of the repository, which is the current folder.
 os.environ.pop("PYTHONSAFEPATH", None)
@@ -57,12 +57,12 @@ def _stack(context: int = 0) -> list[inspect.FrameInfo]:
 # of pytest's frames: 0.25 s for every Learner.
 inspect.stack = _stack
 
-# Imports and collection make millions of objects that stay: a fifth of the time of a worker's start
-# went into looking for garbage among them. `pytest_collection_finish` continues.
+# Imports and collection create millions of permanent objects, and a fifth of a worker's start was
+# spent on garbage collection among them. `pytest_collection_finish` enables it again.
 gc.disable()
 
-# No deadline: the machine is shared. Reproducible where a failure cannot be replayed from the
-# local example database.
+# No deadline, because the machine is shared. Reproducible where a failure cannot be replayed from
+# the local example database.
 hypothesis.settings.register_profile("here", deadline=None, max_examples=50)
 hypothesis.settings.register_profile(
     "ci", deadline=None, max_examples=50, derandomize=True, print_blob=True
@@ -101,17 +101,17 @@ LONG = (
     "faults/test_fuzz.py",
     "faults/test_hostile_files.py",
 )
-"""Files that take longest, the longest first: begun last, one would keep a single worker busy."""
+"""The slowest files first: started last, they would keep a single worker busy."""
 
 _THOROUGH_SECONDS = 1800
-"""For programs that start several times, on a machine that others keep busy."""
+"""Timeout of programs that start several times, on a machine that others keep busy."""
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Mark each test with its folder's tier, so that ``-m`` works without markers in every file.
 
-    The long files come first. What is thorough, and takes many minutes, or needs a GPU is left out
-    unless ``-m`` asks for it.
+    Slow files come first. Thorough tests, those that take many minutes, and those that need a GPU
+    are deselected unless ``-m`` asks for them.
     """
     for item in items:
         if item.path.is_relative_to(_TESTS):
@@ -133,23 +133,23 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_collection_finish() -> None:
-    """Look for garbage again, but not among what was imported and collected."""
+    """Enable garbage collection, except for everything imported and collected so far."""
     gc.freeze()
     gc.enable()
 
 
 @pytest.fixture(autouse=True)
 def _leaves_the_working_folder() -> Iterator[None]:
-    """A test that goes elsewhere and stays there breaks another one, in some order of the files."""
+    """A test that stays in another folder would break others, in some order of the files."""
     before = Path.cwd()
     yield
-    os.environ.pop("PYTHONSAFEPATH", None)  # set by a test that called the program's own start
+    os.environ.pop("PYTHONSAFEPATH", None)  # set by a test that called `main`
     if Path.cwd() != before:
         os.chdir(before)
         pytest.fail("the test left another working folder behind: use monkeypatch.chdir")
 
 
-# Service -> where its program may be: a name on PATH, or a pattern below the root folder.
+# Service -> path of its program: a name on PATH, or a pattern below the root folder.
 _SERVICES = {
     "postgresql": ("postgres", "usr/lib/postgresql/*/bin/postgres"),
     "prometheus": ("prometheus",),
@@ -170,10 +170,10 @@ def _find_program(service: str) -> Path | None:
 
 @pytest.fixture(scope="session")
 def require_service() -> Callable[[str], Path]:
-    """``require_service("postgresql")`` gives the program's path.
+    """``require_service("postgresql")`` returns the program's path.
 
-    Where it is not installed the test is skipped with the reason; with ``CI=true`` it fails, so
-    that a suite never turns green by leaving things out.
+    If it is not installed, the test is skipped with the reason; with ``CI=true`` it fails, so that
+    a suite never passes by skipping tests.
     """
 
     def require(service: str) -> Path:
@@ -194,7 +194,7 @@ def local_ray() -> Iterator[None]:
     import ray
 
     ray.init(
-        address="local",  # never one that happens to run on this machine
+        address="local",  # never another Ray of this machine
         num_cpus=2,
         include_dashboard=False,
         log_to_driver=True,

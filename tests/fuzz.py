@@ -1,9 +1,9 @@
-"""Changes sealed folders, exports and YAML at random, and reads them: `make fuzz`.
+"""Change sealed folders, exports and YAML at random, and read them: `make fuzz`.
 
-Whatever comes of a file, it is a value, or one of the package's own errors: no other exception, no
-read that takes longer than `PATIENCE`, nothing written beside the fuzzer's folder, no program
-started and no module of a file's choice imported. `SEED` and the number of the case give the case
-again: `python -m tests.fuzz --seed 7 --case 1234`.
+Reading a file may return a value or raise one of the package's own errors. It must not raise other
+exceptions, take longer than `PATIENCE`, write outside the fuzzer's folder, start a program or
+import a module that the file names. `SEED` and the number of the case reproduce it: `python -m
+tests.fuzz --seed 7 --case 1234`.
 """
 
 from __future__ import annotations
@@ -58,14 +58,14 @@ JUNK: tuple[Any, ...] = (
 
 
 class Violation(Exception):  # noqa: N818  not an error of the package, and not to be caught by it
-    """Something that no file may bring about."""
+    """Behavior that no file may cause."""
 
 
-# What a process does beside reading ---------------------------------------------------------------
+# Side effects of reading --------------------------------------------------------------------------
 
 
 class Watch:
-    """Notes what is written outside a folder, and what is started."""
+    """Records writes outside a folder, and processes that are started."""
 
     def __init__(self, folder: Path) -> None:
         self._inside = (str(folder), "/dev/null", "/proc/")
@@ -101,7 +101,7 @@ class Watch:
             self._written(arguments[1 if event in ("os.rename", "os.symlink", "os.link") else 0])
 
     def _written(self, path: Any) -> None:
-        # Python names files below an open folder without that folder, as `rmtree` has them.
+        # `rmtree` passes names relative to an open folder.
         text = os.fsdecode(path) if isinstance(path, str | bytes | os.PathLike) else ""
         if text.startswith("/") and not text.startswith(self._inside):
             self.seen.append(f"written: {text}")
@@ -111,7 +111,7 @@ class Watch:
 
 
 def change_bytes(rng: random.Random, data: bytes) -> bytes:
-    """Flipped, cut, doubled, or overwritten somewhere."""
+    """Flip, cut, duplicate or overwrite bytes somewhere."""
     changed = bytearray(data)
     for _ in range(rng.choice((1, 1, 2, 8))):
         at = rng.randrange(len(changed) + 1)
@@ -133,7 +133,7 @@ def change_bytes(rng: random.Random, data: bytes) -> bytes:
 
 
 def change_value(rng: random.Random, document: Any) -> Any:
-    """Replace, drop, double or rename one value somewhere in a document."""
+    """Replace, drop, duplicate or rename one value somewhere in a document."""
     document = copy.deepcopy(document)
     for _ in range(rng.choice((1, 1, 1, 2, 4))):
         here = list(_places(document))
@@ -175,7 +175,7 @@ def change_json(rng: random.Random, data: bytes) -> bytes:
 
 
 def change_safetensors(rng: random.Random, data: bytes) -> bytes:
-    """The header as a document, its length, or bytes."""
+    """Change the header as a document, its length, or bytes."""
     size = int.from_bytes(data[:8], "little")
     if rng.random() < 0.4:
         return change_bytes(rng, data)
@@ -191,7 +191,7 @@ def change_safetensors(rng: random.Random, data: bytes) -> bytes:
 
 
 def change_text(rng: random.Random, data: bytes) -> bytes:
-    """Lines and words of YAML or CSV moved, doubled, replaced."""
+    """Move, duplicate or replace lines and words of YAML or CSV."""
     if rng.random() < 0.3:
         return change_bytes(rng, data)
     lines = data.decode().split("\n")
@@ -231,7 +231,7 @@ CHANGES: dict[str, Callable[[random.Random, bytes], bytes]] = {
 
 
 def change_file(rng: random.Random, file: Path) -> None:
-    """Change a file as its kind is changed; now and then it is no file any more."""
+    """Change a file according to its kind; rarely replace it by something else."""
     if rng.random() < 0.02:
         file.unlink()
         rng.choice((os.mkfifo, Path.mkdir, lambda path: path.symlink_to("/dev/zero")))(file)
@@ -239,11 +239,11 @@ def change_file(rng: random.Random, file: Path) -> None:
     file.write_bytes(CHANGES[file.suffix](rng, file.read_bytes()))
 
 
-# What is changed, and who reads it ----------------------------------------------------------------
+# Subjects, and their readers ----------------------------------------------------------------------
 
 
 def sealed_policy(rng: random.Random, sound: Path, folder: Path) -> Callable[[], object]:
-    """A node; mostly sealed again, as an attacker does."""
+    """A node; usually sealed again, as an attacker would do."""
     shutil.copytree(sound / "node", folder / "node")
     files = [path for path in (folder / "node").rglob("*") if path.is_file()]
     changed = rng.choice(sorted(files))
@@ -264,7 +264,7 @@ def sealed_policy(rng: random.Random, sound: Path, folder: Path) -> Callable[[],
 
 
 def _seal_again(folder: Path) -> None:
-    """Put the hashes right: of the weights in the handoff, of all files in the manifest."""
+    """Correct the hashes: of the weights in the handoff, of all files in the manifest."""
     node = folder / "node"
     handoff = node / "handoff" / "handoff.json"
     try:
@@ -280,11 +280,11 @@ def _seal_again(folder: Path) -> None:
             manifest["files"][name] = _record(node / name).model_dump()
         (node / "manifest.json").write_text(json.dumps(manifest))
     except (OSError, ValueError, TypeError, LookupError, AttributeError):
-        pass  # it is too far gone to be sealed
+        pass  # too damaged to be sealed
 
 
 def packed_policy(rng: random.Random, sound: Path, folder: Path) -> Callable[[], object]:
-    """A policy's one file."""
+    """A policy's only file."""
     file = folder / "policy.safetensors"
     shutil.copy(sound / "policy.safetensors", file)
     change_file(rng, file)
@@ -298,7 +298,7 @@ def packed_policy(rng: random.Random, sound: Path, folder: Path) -> Callable[[],
 
 
 def export(rng: random.Random, sound: Path, folder: Path) -> Callable[[], object]:
-    """An exported sweep, and what a report reads of it before it draws."""
+    """An exported sweep, and the tables that a report reads before it draws."""
     shutil.copytree(sound / rng.choice(("parquet", "csv")), folder / "export")
     change_file(rng, rng.choice(sorted((folder / "export").iterdir())))
 
@@ -333,7 +333,7 @@ KINDS = (sealed_policy, packed_policy, export, sweep_file, state)
 
 
 def make_sound(folder: Path) -> None:
-    """One of each kind, as the package itself writes it."""
+    """One subject of each kind, written by the package itself."""
     node = seal_policy(folder, PENDULUM)
     (folder / "policy.safetensors").write_bytes(load_policy(node).to_bytes())
     write_export(folder / "parquet")
@@ -344,7 +344,7 @@ def make_sound(folder: Path) -> None:
 
 
 def one_case(seed: int, number: int, sound: Path, folder: Path, watch: Watch) -> str:
-    """Make and read a case; what came of it.
+    """Make and read a case; returns its outcome.
 
     Raises:
         Violation: Something that no file may bring about.
@@ -356,7 +356,7 @@ def one_case(seed: int, number: int, sound: Path, folder: Path, watch: Watch) ->
     try:
         with watch:
             signal.setitimer(signal.ITIMER_VIRTUAL, PATIENCE)
-            signal.alarm(3 * PATIENCE)  # on a clock: for what waits and never comes
+            signal.alarm(3 * PATIENCE)  # on a clock: for a reader that waits forever
             try:
                 read()
             except OWN_ERRORS as error:
@@ -376,7 +376,7 @@ def one_case(seed: int, number: int, sound: Path, folder: Path, watch: Watch) ->
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Try cases until the time is over; 1 with the first that must not be."""
+    """Try cases until the time is over; 1 at the first violation."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("--seconds", type=float, default=600.0, help="Of processor time.")
     parser.add_argument("--seed", type=int, default=0)

@@ -1,7 +1,7 @@
-"""Files as a stranger may make them: sound ones to begin with, and what is wrong with others.
+"""Files as a stranger may make them: valid ones, and others with defects.
 
-`python -m tests.hostile_files FOLDER` has the programs read each hostile file of `CORPUS` and says
-what came of it, as lines of JSON.
+`python -m tests.hostile_files FOLDER` runs the programs on each hostile file of `CORPUS`, and
+prints the outcomes as lines of JSON.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ PENDULUM = Task(name="Pendulum", env_id="Pendulum-v1", horizon=20, success_key=N
 
 
 def write_policy(folder: Path, task: Task) -> Path:
-    """A handoff with weights for the spaces of Pendulum, whatever its task is."""
+    """A handoff with weights for the spaces of Pendulum, for any task."""
     run = RunSettings.model_validate(
         {"task": task, "variant": "tac", "seed": 0, "tac": {"hidden_sizes": [2]}}
     )
@@ -70,7 +70,7 @@ def seal_policy(storage: Path, task: Task) -> Path:
     return storage / "node"
 
 
-# Files that are none ------------------------------------------------------------------------------
+# Not regular files --------------------------------------------------------------------------------
 
 
 def _device(path: Path) -> None:
@@ -93,7 +93,7 @@ def _sparse(path: Path) -> None:
 STRANGE = {"device": _device, "FIFO": os.mkfifo, "socket": _socket, "sparse": _sparse}
 
 
-# Sound ones ---------------------------------------------------------------------------------------
+# Valid files --------------------------------------------------------------------------------------
 
 SWEEP: dict[str, Any] = {
     "name": "mine",
@@ -194,10 +194,10 @@ DEEP = "[" * 100_000
 
 
 class Hostile(NamedTuple):
-    """A file, the program that reads it, and what it must say."""
+    """A file, the program that reads it, and the expected message."""
 
     make: Callable[[Path], list[str]]
-    """Makes it in an empty folder; the program's arguments."""
+    """Creates it in an empty folder; returns the program's arguments."""
     said: str
     """A part of the message."""
 
@@ -235,7 +235,7 @@ def _environment(**changes: Any) -> dict[str, Any]:
 
 
 def _policy(file: str, change: Callable[[Path], object]) -> Callable[[Path], list[str]]:
-    """A sealed policy with one of its files changed, and its hashes as they were."""
+    """A sealed policy with one changed file and the old hashes."""
 
     def make(folder: Path) -> list[str]:
         node = seal_policy(folder, PENDULUM)
@@ -246,7 +246,7 @@ def _policy(file: str, change: Callable[[Path], object]) -> Callable[[Path], lis
 
 
 def _handoff(change: Callable[[dict[str, Any]], object]) -> Callable[[Path], list[str]]:
-    """A handoff that came alone, its manifest changed."""
+    """A handoff without its run, with a changed manifest."""
 
     def make(folder: Path) -> list[str]:
         file = write_policy(folder, PENDULUM) / "handoff" / "handoff.json"
@@ -259,7 +259,7 @@ def _handoff(change: Callable[[dict[str, Any]], object]) -> Callable[[Path], lis
 
 
 def _packed(change: Callable[[Path], object]) -> Callable[[Path], list[str]]:
-    """A policy's one file, changed."""
+    """A policy's only file, changed."""
 
     def make(folder: Path) -> list[str]:
         file = folder / "policy.safetensors"
@@ -322,7 +322,7 @@ def _about(change: dict[str, Any] | str) -> Callable[[Path], None]:
 
 
 def _nulls(rows: int, together: int = 1_000_000) -> Callable[[Path], None]:
-    """A table with any number of rows in next to no bytes."""
+    """A table with any number of rows in almost no bytes."""
 
     def apply(file: Path) -> None:
         kinds = {"run": pa.int64(), "metric": pa.string(), "env_steps": pa.int64()}
@@ -336,7 +336,7 @@ def _nulls(rows: int, together: int = 1_000_000) -> Callable[[Path], None]:
 
 
 def _long_texts(file: Path) -> None:
-    """One long text in each of many rows, which a dictionary has once."""
+    """The same long text in many rows, stored once in a dictionary."""
     rows = 50_000
     numbers = pa.array(np.zeros(rows, np.int64))
     table = {"run": numbers, "metric": pa.repeat("x" * 20_000, rows).dictionary_encode()}
@@ -345,7 +345,7 @@ def _long_texts(file: Path) -> None:
 
 
 def _unpacking(cells: int, **options: Any) -> Callable[[Path], None]:
-    """Texts of a megabyte each, which take next to nothing in the file."""
+    """Texts of a megabyte each that compress to almost nothing."""
 
     def apply(file: Path) -> None:
         numbers = pa.array(np.zeros(cells, np.int64))
@@ -358,7 +358,7 @@ def _unpacking(cells: int, **options: Any) -> Callable[[Path], None]:
 
 
 def _fewer_rows_said(file: Path) -> None:
-    """The footer says 5 rows, and its one row group two million."""
+    """The footer declares 5 rows, and its only row group two million."""
     _nulls(2_000_000, 2_000_000)(file)
     data, rows = file.read_bytes(), bytes((0x16, 0x80, 0x92, 0xF4, 0x01))
     assert data.count(rows) > 1, "Thrift's number of rows of the file, and of the group"
@@ -366,7 +366,7 @@ def _fewer_rows_said(file: Path) -> None:
 
 
 def _less_said(file: Path) -> None:
-    """The footer says that 100 texts of a megabyte unpack to 100 bytes."""
+    """The footer declares that 100 texts of a megabyte unpack to 100 bytes."""
     _unpacking(100, write_batch_size=1)(file)
     data = file.read_bytes()
     footer = parquet.ParquetFile(file).metadata
@@ -382,7 +382,7 @@ def _less_said(file: Path) -> None:
 
 
 def _varint(value: int, length: int = 0) -> bytes:
-    """A number as Thrift's compact protocol has it, in `length` bytes."""
+    """A number in Thrift's compact protocol, in `length` bytes."""
     value <<= 1
     parts: list[int] = []
     while value or len(parts) < length:
@@ -596,16 +596,16 @@ CORPUS: dict[str, Hostile] = {
     ),
 }
 SECONDS, MEGABYTES = 1.0, 300
-"""Of processor time and memory that a refusal may take, beyond what its program takes anyway."""
+"""Processor time and memory that a refusal may need in addition to its program's own."""
 PATIENCE = 60
-"""Seconds on a clock, where the machine has other things to do."""
+"""Seconds on a clock, for a busy machine."""
 
 
 # The programs -------------------------------------------------------------------------------------
 
 
 def run(arguments: list[str]) -> tuple[object, str]:
-    """A program's exit code and what it says."""
+    """A program's exit code and output."""
     said = io.StringIO()
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
         try:
@@ -623,7 +623,7 @@ def run(arguments: list[str]) -> tuple[object, str]:
 
 
 def _refuse_in_a_fork(name: str, folder: Path) -> dict[str, Any]:
-    """What comes of one file, measured in a process that has loaded everything before."""
+    """Outcome of one file, measured in a process that has loaded everything before."""
     folder.mkdir()
     arguments = CORPUS[name].make(folder)
     before = sorted(path.name for path in folder.rglob("*"))
@@ -654,8 +654,8 @@ def _refuse_in_a_fork(name: str, folder: Path) -> dict[str, Any]:
 
 
 def results(folder: Path) -> Iterator[dict[str, Any]]:
-    """What comes of each file of the corpus."""
-    # What a program loads before it reads is not what reading costs.
+    """Outcome of each file of the corpus."""
+    # Loading a program's modules is not part of the cost of reading.
     for number, arguments in enumerate((_plan_of(), _export("sweep.json", lambda file: None))):
         (folder / f"sound{number}").mkdir()
         code, said = run(arguments(folder / f"sound{number}"))

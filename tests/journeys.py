@@ -1,11 +1,10 @@
-"""Five journeys through the package, as traces show them, and their section of the docs.
+"""Five journeys through the package, from traces, and their section of the docs.
 
 python -m tests.journeys            # exit code 1 if the section is out of date
 python -m tests.journeys --write    # write it
 
-A trace runs in a process of its own and lists every function of the package in the order of its
-first call, and the files that have these functions. Class bodies count as functions, as
-`sys.setprofile` reports them.
+A trace runs in its own process and lists every function of the package in the order of its first
+call, and the files with these functions. Class bodies count as functions, as in `sys.setprofile`.
 """
 
 from __future__ import annotations
@@ -125,7 +124,7 @@ def trace_weights(called: Called, folder: Path) -> None:
 
 
 def trace_search(called: Called, folder: Path) -> None:
-    """A search of two trials whose runs are played by a formula."""
+    """A search of two trials whose runs are computed by a formula."""
     from tests.played_search import searched
 
     with called.recording():
@@ -152,9 +151,9 @@ class Journey:
     """Markdown with the names of functions, in their order."""
     trace: Callable[[Called, Path], None]
     traced: Sequence[int]
-    """Numbers of the steps whose names the trace must call; the last name of each in this order."""
+    """Numbers of the steps whose functions the trace calls; the last ones in this order."""
     example: str
-    """The traced example, in words."""
+    """Description of the traced example."""
     most_files: int
     """Largest number of files of the package that the trace may enter."""
 

@@ -1,4 +1,4 @@
-"""A sweep that was begun, as its storage has it: nothing of it is trained."""
+"""A sweep that was started, as its storage has it, without training."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["kept_sweep"]
 
 
 def kept_sweep(storage: Path, tracking_uri: str | None = None, **settings: Any) -> Path:
-    """The folder of a sweep `s` that was tracked, its record there but for passwords."""
+    """The folder of a tracked sweep `s`, with its whole record except for passwords."""
     file = storage / "s.yaml"
     stages = [{"name": "train", "variant": "tac"}]
     document = {

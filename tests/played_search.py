@@ -1,4 +1,4 @@
-"""Searches with a formula in place of training; everything else is real."""
+"""Searches with a formula instead of training; everything else is real."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ class Driver:
         self.controller.finished(node, result)
 
     def trials(self, arm: int = 0) -> list[dict[str, Any]]:
-        """As plain data, with plain numbers."""
+        """The storage as plain data, with plain numbers."""
         (found,) = outcome(self.controller)
         trials: list[dict[str, Any]] = json.loads(json.dumps(found["arms"][arm]["trials"]))
         return trials

@@ -8,9 +8,9 @@ import socket
 
 
 def free_port() -> int:
-    """A port of 127.0.0.1 at which nobody listens, below those that connections get on Linux.
+    """An unused port of 127.0.0.1, below those that Linux gives to connections.
 
-    One that the kernel chooses is among those: another connection may have it before the server
+    A port that the kernel chooses is among those: another connection could get it before the server
     does, whose start takes seconds.
     """
     while True:

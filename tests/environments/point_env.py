@@ -17,7 +17,7 @@ Array = NDArray[np.float32]
 
 
 class GripperError(Exception):
-    """It needs two arguments, so it can be neither copied nor pickled."""
+    """An environment with two arguments, so it can be neither copied nor pickled."""
 
     def __init__(self, what: str, said: str) -> None:
         super().__init__(f"{what}\n{said}")

@@ -1,8 +1,9 @@
 """Machines of a small network, made of Linux namespaces, for tests that break the network.
 
 A machine has its own network, processes, host name, `/tmp` and `/dev/shm`, and sees the rest of
-this machine's disk read-only. The wires end in this process, which forwards the frames, so a test
-can cut or slow down a machine's wire. The kernel ends a machine with the process that made it.
+this machine's disk read-only. The cables end in this process, which forwards the frames, so a test
+can cut or slow down a machine's cable. The kernel ends a machine when the process that created it
+ends.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ BIN = Path(sys.executable).parent
 ROOT = Path(__file__).resolve().parents[2]
 """The checkout with the installed package, which a machine sees even if it is below `/tmp`."""
 DELAY_SECONDS, LOSS = 0.1, 0.01
-"""Of a slow wire, for each frame in either direction."""
+"""Properties of a slow cable, for each frame in either direction."""
 
 _TUNSETIFF, _TAP_WITHOUT_HEADER = 0x400454CA, 0x1002
 _UNSHARE = ["unshare", "--net", "--mount", "--pid", "--uts", "--fork", "--kill-child"]
@@ -48,11 +49,11 @@ cat <&3 &
 echo ready
 wait
 """
-"""The first process of a machine: ends with its input, and reaps orphans."""
+"""The first process of a machine; it ends with its input, and reaps orphans."""
 
 
 class Network(threading.Thread):
-    """A switch between machines; `close` ends them too."""
+    """A switch between machines; `close` also ends the machines."""
 
     def __init__(self) -> None:
         super().__init__(daemon=True)
@@ -110,7 +111,7 @@ def _mac(number: int) -> bytes:
 
 
 class Host:
-    """A machine; `environment` is that of its programs.
+    """A machine whose programs get `environment`.
 
     Raises:
         OSError: This machine does not allow namespaces or network devices.
@@ -158,7 +159,7 @@ class Host:
         return Path(f"/proc/{self._init}/root{path}")
 
     def start(self, script: str, **options: Any) -> subprocess.Popen[str]:
-        """Start a shell script; without `options` its output goes to `/tmp/log`."""
+        """Start a shell script; without `options` its output is written to `/tmp/log`."""
         if not options:
             script = f"exec >>/tmp/log 2>&1; {script}"
         spaces = [f"--target={self._init}", "--net", "--mount", "--pid", "--uts"]
@@ -168,7 +169,7 @@ class Host:
         return process
 
     def call(self, script: str) -> str:
-        """Run a shell script to its successful end; its output."""
+        """Run a shell script to its successful end; returns its output."""
         process = self.start(script, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
         output = process.communicate(timeout=300)[0]
         if process.returncode:
@@ -176,7 +177,7 @@ class Host:
         return output
 
     def kill(self, name: str = "") -> None:
-        """Kill the programs called `name`, by default all."""
+        """Kill the programs called `name`, or all of them."""
         here = Path(f"/proc/{self._init}/ns/pid").readlink()
         for process in psutil.process_iter():
             with contextlib.suppress(OSError, psutil.NoSuchProcess):
@@ -185,7 +186,7 @@ class Host:
                     process.kill()
 
     def close(self) -> None:
-        """End it: without its first process, the kernel ends the others and removes the rest."""
+        """End the machine; the kernel ends its other processes and removes the rest."""
         for process in (self._life, *self._started):
             with process:
                 process.kill()

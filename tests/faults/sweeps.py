@@ -24,7 +24,7 @@ PATIENCE = 900.0
 
 
 def document(**changes: Any) -> dict[str, Any]:
-    """A sweep of three runs of some seconds, with a checkpoint at every report."""
+    """A sweep of three short runs, with a checkpoint at every report."""
     whole: dict[str, Any] = yaml.safe_load(yaml.safe_dump(SWEEP))
     whole["defaults"]["env_steps"] = 4000
     whole["checkpoints"] = {"minutes": 0.0001}
@@ -33,7 +33,7 @@ def document(**changes: Any) -> dict[str, Any]:
 
 @dataclass
 class OwnProgram(Program):
-    """A program whose processes end with the test in any case."""
+    """A program whose processes always end with the test."""
 
     started: list[subprocess.Popen[str]] = field(default_factory=list)
 

@@ -219,7 +219,7 @@ class Seen(Listener):
 def test_a_driver_takes_the_next_free_run(
     tmp_path: Path, sweep_document: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It waits for a parent that is trained elsewhere, and takes over from a dead process."""
+    """The driver waits for a parent trained elsewhere, and takes over from a dead process."""
     sweep_document["seeds"] = [0, 1]
     sweep, seen = opened(tmp_path, sweep_document), Seen()
     shared = SharedRuns(sweep, [seen])
@@ -252,7 +252,7 @@ def test_a_driver_takes_the_next_free_run(
 
 
 def test_tune_keeps_nothing_of_ended_runs() -> None:
-    """Ray's own manager keeps results of reused processes, and requests that it cancelled."""
+    """Ray's own manager keeps results of reused processes, and requests that it canceled."""
     manager = RayActorManager(resource_manager=MagicMock())
     live, cancelled = (
         manager.add_actor(object, {}, PlacementGroupFactory([{"CPU": 1}])) for _ in range(2)

@@ -1,7 +1,8 @@
 """The system time changes while a sweep runs, for its driver and all of its workers.
 
-By a module that Python imports when it starts. Not by libfaketime: with it, `time.sleep` of Python
-3.11 fails where only the time of day is to be another (EINVAL, version 0.9.10 of Debian 12).
+A module that Python imports at its start changes it. libfaketime does not work: with it,
+`time.sleep` of Python 3.11 fails if only the time of day is changed (EINVAL, version 0.9.10 of
+Debian 12).
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ def test_a_clock_that_jumps_forward_and_back(
 def test_killed_with_a_fast_clock_and_resumed(
     program: Program, clock: Clock, unbroken: Path, tmp_path: Path
 ) -> None:
-    """Leases of dead processes that expire in an hour delay nobody."""
+    """Leases of dead processes that expire in an hour do not delay other processes."""
     process = sweeps.start_until(program, "pretrain/seed0: 8")
     clock.set(HOUR)
     sweeps.read_until(process, "pretrain/seed0: finished")

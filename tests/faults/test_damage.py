@@ -1,6 +1,6 @@
 """Damaged checkpoints and handoffs are found, named, never executed, and survived if possible.
 
-One node as a trial, in this process; what is damaged is what a cut run has left.
+One node as a trial, in this process; the damage is done to the files of an interrupted run.
 """
 
 from __future__ import annotations
@@ -184,7 +184,7 @@ def test_a_run_refuses_a_damaged_handoff(tmp_path: Path) -> None:
 
 
 def test_a_worker_leaves_a_run_of_another_process(tmp_path: Path) -> None:
-    """A worker that outlived its driver, or another sweep, is not disturbed or repeated."""
+    """A worker that outlived its driver, or a worker of another sweep, is not disturbed."""
     node = job(tmp_path, settings("tac"))
     theirs = Lease.of_this_process("sweep 'other'").model_copy(
         update={"machine": "another", "host": "far-away", "pid": 77}

@@ -67,12 +67,12 @@ def test_a_server_that_stays_away(program: Program, unbroken: Path, server: Mlfl
     server.start()
     server.wait()
     resume(program)
-    resume(program)  # the second time changes nothing
+    resume(program)  # the second call changes nothing
     same(unbroken, program, server.uri)
 
 
 def test_a_server_that_answers_500(program: Program, unbroken: Path, server: MlflowServer) -> None:
-    """It fails every request from the first run on; `resume` sends everything later."""
+    """The server fails every request from the first run on; `resume` sends everything later."""
     program.write(sweeps.document(mlflow={"tracking_uri": server.uri}))
     process = sweeps.start_until(program, "pretrain/seed0: started")
     server.signal(signal.SIGKILL)

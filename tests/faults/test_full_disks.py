@@ -22,7 +22,7 @@ MakeDisk = Callable[[str], Path]
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[MakeDisk]:
-    """`small_disk("2m")` mounts a disk of that size; skipped without the right to mount."""
+    """`small_disk("2m")` mounts a disk of that size; skips the test without the right to mount."""
     mounted: list[Path] = []
 
     def make(size: str) -> Path:
@@ -108,7 +108,7 @@ def test_a_read_only_disk_is_named(small_disk: MakeDisk) -> None:
 def test_a_disk_that_fills_up_during_a_sweep(
     program: Program, unbroken: Path, small_disk: MakeDisk
 ) -> None:
-    """The runs fail with the reason; with free space, the same command has the same numbers."""
+    """The runs fail with the reason; with free space, the command gives the same numbers."""
     disk = small_disk("64m")
     program.write(sweeps.document(storage=str(disk / "results")))
     process = sweeps.start_until(program, "pretrain/seed0: 4", "pretrain/seed0: 8")

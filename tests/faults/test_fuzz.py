@@ -27,7 +27,7 @@ def test_randomly_changed_files_are_handled_safely(pytestconfig: pytest.Config) 
     )
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout.splitlines()[-1])
-    # Some changed files of each kind are still valid, and others are not.
+    # Some changed files of each kind are still valid, and some are not.
     for kind in ("sealed_policy", "packed_policy", "export", "sweep_file", "state"):
         outcomes = {name for name in found if name.startswith(f"{kind}:")}
         assert f"{kind}: read" in outcomes

@@ -48,7 +48,7 @@ def gpu() -> None:
 
 @pytest.fixture
 def same_random_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A generator on a GPU gives the numbers of one with its seed on a CPU."""
+    """A generator on a GPU produces the same numbers as one on a CPU with the same seed."""
     twins: dict[int, torch.Generator] = {}
 
     def on_cpu(draw: Callable[..., Tensor]) -> Callable[..., Tensor]:

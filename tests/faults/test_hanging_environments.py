@@ -101,7 +101,7 @@ def test_slow_calls_and_updates_are_not_hangs(what: str, tmp_path: Path) -> None
 
 
 def test_a_worker_that_is_killed_leaves_nothing_behind(tmp_path: Path) -> None:
-    """If its watching process is killed, too, then at the next start."""
+    """If its watching process is killed too, the next worker removes the folder."""
     for watching_too in (True, False):
         with worker(tmp_path, "works") as process:
             assert process.stdout is not None

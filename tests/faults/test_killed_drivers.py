@@ -23,7 +23,7 @@ from tests.integration.conftest import Program, call
 def test_a_killed_worker_then_sigterm_then_a_killed_driver(
     program: Program, unbroken: Path
 ) -> None:
-    """In pretraining, after the handoff, and after the resume."""
+    """Kill in pretraining, after the handoff, and after the resume."""
     process = sweeps.start_until(program, "pretrain/seed0: started")
     sweeps.kill_a_worker(process)
     output = sweeps.read_until(process, ": FAILED", "finetune/q=1/seed0: s")
@@ -65,7 +65,7 @@ def test_stopped_in_each_stage(
 
 @pytest.mark.thorough
 def test_a_signal_to_the_process_group_changes_no_number(program: Program, unbroken: Path) -> None:
-    """As sent by `timeout` and Slurm: Ray ends too, before anything can be saved."""
+    """SIGTERM as sent by `timeout` and Slurm: Ray ends too, before anything can be saved."""
     process = sweeps.start_until(program, "pretrain/seed0: started")
     time.sleep(1.0)
     os.killpg(process.pid, signal.SIGTERM)
@@ -113,12 +113,12 @@ def test_a_run_whose_worker_dies_repeatedly_fails_with_the_cause(
 @pytest.mark.thorough
 @pytest.mark.timeout(5400)
 def test_killed_twenty_times_at_random_moments(program: Program, unbroken: Path) -> None:
-    """During planning, the start of Ray, each stage, checkpoints and sending to MLflow."""
+    """Kill during planning, the start of Ray, each stage, checkpoints and sending to MLflow."""
     seed = int(os.environ.get("FAULT_SEED", random.randrange(10**6)))
     print(f"FAULT_SEED={seed}")
     rng, kills, results = random.Random(seed), 0, program.folder / "results"
     while kills < 20:
-        # Before Ray runs there is little to break, so mostly during training.
+        # Before Ray runs there is little state to break, so mostly during training.
         signs = rng.choice([("starting a local Ray",), *[(": started", ": continues")] * 4])
         process = sweeps.start_until(program, *signs, "Results of")
         time.sleep(rng.uniform(0.0, 10.0))
@@ -129,7 +129,7 @@ def test_killed_twenty_times_at_random_moments(program: Program, unbroken: Path)
         output, errors = process.communicate()
         assert process.returncode == 0, output + errors
         comparison.same(unbroken, results)
-        results.rename(program.folder / f"done-{kills}")  # again, from scratch
+        results.rename(program.folder / f"done-{kills}")  # the next attempt, from scratch
     sweeps.finish(program)
     comparison.same(unbroken, results)
 

@@ -72,7 +72,7 @@ print(sum(node["raylet"].get("state") == "ALIVE" for node in nodes))
 """
 RAY = "ray start --block --disable-usage-stats --object-store-memory=100000000 --temp-dir=/tmp/r"
 ALWAYS = "while :; do {}; sleep 1; done"
-"""As `cluster/ray-node.service` restarts a node."""
+"""Restart a node as `cluster/ray-node.service` does."""
 
 
 class Cluster:
@@ -87,7 +87,7 @@ class Cluster:
         self.dashboard = f"http://{self.head.address}:8265"
 
     def start(self) -> None:
-        """S3, Ray, and the user's folder."""
+        """Start S3 and Ray, and make the user's folder."""
         self.network.start()
         self.storage.start(f"exec python -c '{SERVE_S3}'")
         self.start_head()
@@ -179,7 +179,7 @@ class Case:
     job: subprocess.Popen[str]
 
     def read_until(self, *signs: str) -> None:
-        """Read the job's output until it has each of `signs`."""
+        """Read the job's output until each of `signs` has appeared."""
         assert self.job.stdout is not None
         missing, seen = set(signs), []
         for line in self.job.stdout:
@@ -190,11 +190,11 @@ class Case:
         pytest.fail("".join(seen))
 
     def end(self) -> str:
-        """Wait for the end of the job; the rest of its output."""
+        """Wait for the end of the job; returns the rest of its output."""
         return self.job.communicate(timeout=sweeps.PATIENCE)[0]
 
     def finish(self, expected: Path | None = None) -> str:
-        """Wait for the successful end, with the same results to the bit; returns the output."""
+        """Wait for the successful end, with bit-identical results; returns the output."""
         self.cluster.hurry(True)
         output = self.end()
         assert self.job.returncode == 0, output
@@ -231,7 +231,7 @@ def expected(cluster: Cluster, tmp_path_factory: pytest.TempPathFactory) -> Path
 def case(
     cluster: Cluster, expected: Path, tmp_path: Path, request: pytest.FixtureRequest
 ) -> Iterator[Case]:
-    """A sweep whose results are to be `expected`; what the test broke is mended at its end."""
+    """A sweep whose results must equal `expected`; the test's faults are repaired at its end."""
     cluster.hurry(False)
     name = request.node.name.replace("_", "-")
     own = Case(cluster, name, tmp_path, cluster.submit(name))
@@ -269,7 +269,7 @@ def test_s3_answers_500(case: Case, expected: Path) -> None:
 
 
 def test_the_head_is_restarted(case: Case, expected: Path) -> None:
-    """The job ends with it, and is submitted again."""
+    """The job ends with the head, and is submitted again."""
     case.cluster.head.kill()
     case.end()
     assert case.job.returncode != 0

@@ -21,12 +21,12 @@ pytestmark = pytest.mark.thorough
 
 NOBODY = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups")
 READS_ALL = ("--inh-caps=+dac_read_search", "--ambient-caps=+dac_read_search")
-"""Right to read everything and write nothing, if the code is in a home folder."""
+"""Right to read everything and write nothing, for code in a home folder."""
 
 
 @pytest.fixture
 def public() -> Iterator[Path]:
-    """A folder that every user can reach, unlike pytest's."""
+    """A folder that every user can access, unlike pytest's."""
     folder = Path(tempfile.mkdtemp(prefix="music-nobody-", dir="/tmp"))
     folder.chmod(0o777)
     yield folder

@@ -39,8 +39,8 @@ def test_each_method_of_the_journeys_exists(owner: str, name: str) -> None:
 
 
 def test_every_room_is_on_the_page() -> None:
-    rooms = {path.parent.relative_to(PACKAGE).parts[0] for path in CODE if path.parent != PACKAGE}
-    assert rooms == set(re.findall(r"^\| `(\w+)/` \|", PAGE, re.MULTILINE))
+    folders = {path.parent.relative_to(PACKAGE).parts[0] for path in CODE if path.parent != PACKAGE}
+    assert folders == set(re.findall(r"^\| `(\w+)/` \|", PAGE, re.MULTILINE))
 
 
 def test_no_file_is_too_long_and_no_folder_too_full() -> None:

@@ -1,4 +1,4 @@
-"""Rooms import downwards only, and most modules load no Ray, not even by what they import."""
+"""Sub-packages import downwards only; most modules do not load Ray, not even indirectly."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MAY_LOAD_RAY = (
 )
 # torch and numpy only: no environments, no tracking.
 PURE = ("functional", "intrinsic", "replay", "runtime.process", "schedules")
-# Read by the command line before anything heavy is needed.
+# Imported by the command line before heavy libraries are needed.
 LIGHT = ("", "command_line", "errors", "names", "runtime.quiet")
 
 
