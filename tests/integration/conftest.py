@@ -1,4 +1,4 @@
-"""A sweep as a user starts it, on an environment that costs next to nothing."""
+"""A sweep as a user starts it, on a very cheap environment."""
 
 from __future__ import annotations
 
@@ -54,12 +54,12 @@ SWEEP: dict[str, Any] = {
         },
     ],
 }
-"""A small whole sweep; tests change what they are about."""
+"""A small whole sweep; tests change the settings that they test."""
 
 
 @dataclass
 class Program:
-    """`python -m music_rllib.sweep` in a folder of its own."""
+    """`python -m music_rllib.sweep` in its own folder."""
 
     folder: Path
     environment: dict[str, str]
@@ -67,11 +67,11 @@ class Program:
     """The sweep's file below `folder`."""
 
     def write(self, document: dict[str, Any]) -> None:
-        """Put `document` where the program reads it."""
+        """Write `document` to the program's file."""
         (self.folder / self.file).write_text(yaml.safe_dump(document, sort_keys=False))
 
     def start(self, *options: str, command: str = "run") -> subprocess.Popen[str]:
-        """Start it, in a process group of its own."""
+        """Start it in its own process group."""
         return subprocess.Popen(
             [sys.executable, "-m", "music_rllib.sweep", command, self.file, *options],
             cwd=self.folder,
@@ -85,7 +85,7 @@ class Program:
     def run(
         self, *options: str, command: str = "run", timeout: float = 240
     ) -> tuple[int, str, str]:
-        """Run it to its end: exit code, standard output, standard error."""
+        """Run it to its end; returns exit code, standard output, standard error."""
         process = self.start(*options, command=command)
         try:
             output, errors = process.communicate(timeout=timeout)
@@ -94,7 +94,7 @@ class Program:
         return process.returncode, output, errors
 
     def start_until(self, wanted: str, timeout: float = 120) -> subprocess.Popen[str]:
-        """Start it and wait for a line with `wanted` in it."""
+        """Start it and wait for a line that contains `wanted`."""
         process = self.start()
         assert process.stdout is not None
         deadline, seen = time.monotonic() + timeout, []
@@ -111,9 +111,9 @@ class Program:
 def call(
     main: Callable[[Sequence[str]], int], folder: Path, *arguments: str
 ) -> tuple[int, str, str]:
-    """Run a program of ours in this process, in `folder`: exit code, standard output and error.
+    """Run one of the package's programs in this process, in `folder`: exit code, output and errors.
 
-    For commands beside a sweep: a process of their own would load Python's libraries anew.
+    For short commands: in a process of their own they would load Python's libraries again.
     """
     output, errors = io.StringIO(), io.StringIO()
     with (
@@ -126,21 +126,21 @@ def call(
 
 
 def end(process: subprocess.Popen[str]) -> None:
-    """End what `Program.start` started, and its children."""
+    """End the processes that `Program.start` started, and their children."""
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
     process.wait()
 
 
 def rows(output: str) -> list[list[str]]:
-    """Cells of the table of results at a sweep's end."""
+    """Cells of the table of results that a sweep prints at its end."""
     table = output[output.index("Results of") :]
     lines = [line for line in table.splitlines() if re.match(r"\S*seed\d+ ", line)]
     return [re.split(r"\s{2,}", line.strip()) for line in lines]
 
 
 def metric_steps(folder: Path, run: Any, name: str = names.ENV_STEPS) -> list[int]:
-    """Where the embedded MLflow of a sweep in `folder` has values of a run's metric."""
+    """Environment steps at which the embedded MLflow of a sweep in `folder` has a run's metric."""
     from mlflow import MlflowClient
 
     client = MlflowClient(f"sqlite:///{folder}/results/mlflow.db")
@@ -161,12 +161,12 @@ def listening(process: subprocess.Popen[Any]) -> dict[str, set[str]]:
 
 @pytest.fixture
 def sweep_document() -> dict[str, Any]:
-    """A small whole sweep, to change."""
+    """A small whole sweep for changes by tests."""
     return yaml.safe_load(yaml.safe_dump(SWEEP))  # type: ignore[no-any-return]
 
 
 def program_environment() -> dict[str, str]:
-    """This process's, with the test environments importable in driver and workers."""
+    """This process's variables, which make the test environments importable in all processes."""
     return os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (REPOSITORY, ENVIRONMENTS)))}
 
 

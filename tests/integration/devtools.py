@@ -1,6 +1,6 @@
-"""A page in headless Chromium, driven by its DevTools protocol.
+"""A page in headless Chromium, controlled through its DevTools protocol.
 
-Its pictures are kept in the folder that the variable MUSIC_RLLIB_PICTURES names, such as docs/img.
+Screenshots are written to the folder of the variable MUSIC_RLLIB_PICTURES, such as docs/img.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ class Page:
             "about:blank",
         ]
         self.errors: list[str] = []
-        """What the page logged as an error, or did not catch."""
+        """Errors that the page logged or did not catch."""
         self.requests: list[str] = []
-        """What was asked of a server."""
+        """Requests to a server."""
         self._answers: dict[int, asyncio.Future[dict[str, Any]]] = {}
         self._number = 0
 
@@ -102,21 +102,21 @@ class Page:
         return reply.get("result", {})  # type: ignore[no-any-return]
 
     async def go(self, url: str) -> None:
-        """Open `url` anew, even where only what follows its # is another."""
+        """Open `url` again, even if only its fragment (after #) changed."""
         await self._send("Page.navigate", url="about:blank")
         await self._send("Page.navigate", url=url)
 
     async def view(
         self, width: int, height: int, *, dark: bool = False, medium: str = "screen"
     ) -> None:
-        """Make the window so large, smaller than a window of Chromium can be, too."""
+        """Set the size of the window, which may be smaller than Chromium's smallest window."""
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
         await self._send("Emulation.setDeviceMetricsOverride", **size)
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         await self._send("Emulation.setEmulatedMedia", media=medium, features=[scheme])
 
     async def without_script(self, *, off: bool = True) -> None:
-        """Whether pages may run scripts, from the next one on."""
+        """Whether pages may run scripts; applies to the next page."""
         await self._send("Emulation.setScriptExecutionDisabled", value=off)
 
     async def point_at(self, x: float, y: float) -> None:
@@ -137,7 +137,7 @@ class Page:
             await self._send("Input.dispatchMouseEvent", type=moment, **where)
 
     async def evaluate(self, script: str) -> Any:
-        """The value of a JavaScript expression, or of what it promises."""
+        """The value of a JavaScript expression, or of its promise."""
         options = {"returnByValue": True, "awaitPromise": True}
         reply = await self._send("Runtime.evaluate", expression=script, **options)
         return reply["result"].get("value")
@@ -153,7 +153,7 @@ class Page:
             )
 
     async def text(self) -> str:
-        """What is to be read on the page."""
+        """The visible text of the page."""
         return str(await self.evaluate("document.body ? document.body.innerText : ''"))
 
     async def wait_for(self, *words: str) -> str:
@@ -168,7 +168,7 @@ class Page:
         raise AssertionError(f"no {missing} in:\n{text[:3000]}\nerrors: {self.errors}")
 
     async def picture(self, name: str) -> None:
-        """Keep what the window shows as the PNG `name`."""
+        """Save a screenshot of the window as the PNG `name`."""
         await asyncio.sleep(0.5)
         reply = await self._send("Page.captureScreenshot", format="png")
         path = Path(os.environ.get("MUSIC_RLLIB_PICTURES") or self._folder) / name

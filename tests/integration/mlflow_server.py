@@ -1,4 +1,4 @@
-"""An MLflow server that can be killed and started again."""
+"""An MLflow server that can be killed and restarted."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def server_script(folder: Path, password: str, *databases: str) -> Iterator[str]
         try:
             process.wait(timeout=60)
         finally:
-            # Whatever a hard end left; the group is ours.
+            # Processes that survived a kill; the process group belongs to this server.
             if process.poll() is None:
                 os.killpg(process.pid, signal.SIGKILL)
     assert not list(folder.rglob("basic_auth.ini")), "the server must delete its password's file"
@@ -80,7 +80,7 @@ def _wait_for(uri: str, process: subprocess.Popen[Any], log: Path) -> None:
 
 
 class MlflowServer:
-    """``mlflow server`` on `mlflow.db` in a folder, on a port of its own."""
+    """``mlflow server`` on `mlflow.db` in a folder, on its own port."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -111,7 +111,7 @@ class MlflowServer:
             )
 
     def signal(self, number: signal.Signals) -> None:
-        """To the server and its worker: the group of the process that was started here."""
+        """Send a signal to the process group of the server and its worker."""
         if self._process is None:
             return
         os.killpg(self._process.pid, number)
@@ -120,7 +120,7 @@ class MlflowServer:
             self._process = None
 
     def wait(self) -> None:
-        """Until it answers."""
+        """Wait until it answers."""
         deadline = time.monotonic() + PATIENCE
         while time.monotonic() < deadline:
             assert self._process is not None
@@ -136,6 +136,6 @@ class MlflowServer:
 
 
 def comparing(server: str, experiment: str, runs: list[str]) -> str:
-    """Where MLflow compares selected runs."""
+    """URL of MLflow's comparison of selected runs."""
     chosen, experiments = (quote(json.dumps(ids)) for ids in (runs, [str(experiment)]))
     return f"{server}/#/compare-runs?runs={chosen}&experiments={experiments}"

@@ -259,7 +259,7 @@ def test_updates_in_one_call_are_bit_identical_to_single_updates(backbone: str) 
 def test_non_finite_values_spread_as_in_autograd(
     backbone: str, policy_critic: str, bad: float
 ) -> None:
-    """One bad number in each column of a minibatch and each parameter, target networks included."""
+    """One non-finite number in each column of a minibatch, each parameter and target network."""
     settings = {**BACKBONES[backbone], "policy_critic": policy_critic, "entropic_index": 1.5}
     built, batch = ready(**settings, target_bounds=(-0.5, 0.5))
     module = built.module[DEFAULT_MODULE_ID].unwrapped()
@@ -304,7 +304,7 @@ def product(left: Any, right: Any, transposed: tuple[bool, bool], out: Any) -> N
     blas.multiply(left, transposed[0], right, transposed[1], out)
 
 
-# The fourth and fifth are cut where BLAS multiplies small matrices without copies.
+# The fourth and fifth are the sizes at which BLAS multiplies small matrices without copies.
 @pytest.mark.parametrize(
     ("rows", "inner", "columns"),
     [(256, 28, 128), (5, 3, 1), (1, 1, 7), (256, 128, 128), (130, 250, 320), (0, 3, 4)],
@@ -393,7 +393,7 @@ def test_learning_rates_of_rllibs_schedulers_are_used() -> None:
 
 
 def read_only(value: Any) -> Any:
-    """Nested dictionaries with copies of their arrays, as RLlib gets them from another process."""
+    """Nested dictionaries with copies of their arrays, as RLlib receives from other processes."""
     if isinstance(value, dict):
         return {key: read_only(inner) for key, inner in value.items()}
     if isinstance(value, np.ndarray):

@@ -299,13 +299,13 @@ def test_colored_noise_is_standard_normal_with_the_given_spectrum(
 def test_episodes_with_colored_noise_are_samples_of_the_policy_with_random_actions(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A policy that acts by its noise shows the noise: smooth, but for the random actions."""
+    """A policy with smooth noise acts smoothly, except for its random actions."""
     behaviour = {"kind": "colored_noise", "exponent": 2.0, "random_share": 0.2}
     made = runner(Countdown, num_envs=500, max_episode_steps=9, behaviour=behaviour)
     monkeypatch.setattr(made.module, "actor", lambda: lambda _, noise: np.clip(noise / 9, -1, 1))
     ends = np.concatenate([np.diff(one.actions[:, 0]) for one in made.sample()])
     sudden = np.abs(ends) > 0.25
-    # A step is sudden unless both of its actions are smooth, or a random one is near by chance.
+    # A step is sudden unless both of its actions are smooth, or a random one is close by chance.
     assert 0.2 < sudden.mean() < 1 - 0.8**2
 
 
@@ -339,7 +339,7 @@ def test_unusable_observations_and_missing_time_limit_are_named() -> None:
 @pytest.mark.parametrize("bad", [np.nan, -np.inf, 1e30])
 def test_a_bad_number_is_named_with_its_environment_episode_and_step(bad: float) -> None:
     class Spoilt(Countdown):
-        """The first step of the second sub-environment's second episode returns it."""
+        """The first step of the second sub-environment's second episode contains it."""
 
         def __init__(self, config: Any = None) -> None:
             super().__init__(config)

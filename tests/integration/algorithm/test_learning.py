@@ -34,7 +34,7 @@ def test_tac_improves_pendulum_clearly_over_a_random_policy() -> None:
         algo.train()
     trained = float(algo.evaluate()["env_runners"]["episode_return_mean"])
     algo.stop()
-    # Random policies score about -1,200 +- 300 an episode, a swing-up at least -400.
+    # Random policies score about -1,200 +- 300 per episode, a swing-up at least -400.
     assert random_return < -900
     assert trained > -500
 
@@ -61,7 +61,7 @@ def reports_of(task: str, env_steps: int, seed: int, **tac: Any) -> list[dict[st
 
 
 def test_music_u_learns_to_move_the_object_and_to_measure_it() -> None:
-    """Without a simulator, in seconds."""
+    """MUSIC's reward without a simulator, in seconds."""
     last = reports_of(
         "PointCarry",
         3_000,
@@ -88,7 +88,7 @@ def learns_to_push_and_measure(seed: int) -> bool:
     noise = {"kind": "gaussian_noise"}
     shape: dict[str, Any] = {"hidden_sizes": (128, 128), "replay_ratio": 0.4}
     reports = reports_of("FetchPush", 12_000, seed, **shape, behaviour=noise)
-    # Its first thousand steps are those of a random policy.
+    # The first thousand steps are those of a random policy.
     random_displacement = reports[1][names.TRAIN_DISPLACEMENT]
     late = reports[-4:]
     displacement = np.mean([report[names.TRAIN_DISPLACEMENT] for report in late])

@@ -404,7 +404,7 @@ def test_q_bias_equals_its_definition() -> None:
 
 
 def test_remote_runners_and_learner_learn_and_resume_like_local_ones(tmp_path: Path) -> None:
-    """And a bad reward stops them, too."""
+    """A bad reward stops them too."""
     register_spoilt(530)
     algo = build("Spoilt", music=MUSIC_U, where={"num_env_runners": 1, "num_learners": 1})
     first = [algo.train() for _ in range(3)][-1]
@@ -491,7 +491,7 @@ def register_spoilt(step: int) -> None:
 
 
 def check_that_a_bad_reward_stops(algo: TAC) -> None:
-    """Train until it comes: it reaches neither the replay nor the weights."""
+    """Train until the bad reward, which must reach neither the replay nor the weights."""
     seen = []
 
     def train() -> None:

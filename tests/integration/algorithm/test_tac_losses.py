@@ -65,7 +65,7 @@ def gradients(loss: Tensor, module: Any) -> dict[str, Tensor]:
 class ReferenceSAC:
     """SAC with a value network (Haarnoja et al. 2018a, eq. 5-13), on copies of the same weights.
 
-    Every loss is written separately, with torch.distributions' densities and plain matrix
+    Every loss is computed separately, with torch.distributions' densities and plain matrix
     products, one critic after the other.
     """
 
@@ -220,7 +220,7 @@ def test_automatic_target_entropy_is_sacs_at_q_1() -> None:
 
 @pytest.mark.parametrize("policy", ["stochastic", "deterministic"])
 def test_action_l2_penalises_the_squashed_action(policy: str) -> None:
-    """d tanh(u)^2 / du = 2 tanh(u) (1 - tanh(u)^2), by hand below."""
+    """d tanh(u)^2 / du = 2 tanh(u) (1 - tanh(u)^2), computed by hand below."""
     ddpg = {"bootstrap": "critics", "alpha": 0.0, "behaviour": {"kind": "gaussian_noise"}}
     settings: dict[str, Any] = ddpg if policy == "deterministic" else {"alpha": 0.0}
     built = learner(policy=policy, action_l2=1.0, policy_critic="first", **settings)

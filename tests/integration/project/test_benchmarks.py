@@ -27,7 +27,7 @@ def test_a_group_is_measured_printed_and_written(tmp_path: Path) -> None:
     values = {row["what"]: row for row in document["rows"]}
     hindsight = values["HER, 20,000 trajectories: a minibatch"]
     assert hindsight["target"] == "<= 0.25"
-    # Which of them takes longer is for a benchmark, on a machine that does nothing else.
+    # Their times are compared by benchmarks on an idle machine, not here.
     assert hindsight["value"] > 0
     assert values["uniform, 20,000 trajectories"]["value"] > 0
     assert "load_average_before" in document["machine"]

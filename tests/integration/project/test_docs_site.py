@@ -13,7 +13,7 @@ import pytest
 from tests.integration.devtools import Page
 
 ROOT = Path(__file__).parents[3]
-"""Folder in which the picture is kept, such as docs/img."""
+"""Folder for screenshots, such as docs/img."""
 
 
 @pytest.mark.parametrize("page", ["configuration", "results"])

@@ -1,4 +1,4 @@
-"""The programs of examples/, as their README says; load_policy.py is in test_first_hour.py."""
+"""The programs of examples/, run as in their README; load_policy.py is in test_first_hour.py."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def printed(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> Callable[..., str]:
-    """What an example prints, without a process and a Ray of its own; it must end well."""
+    """Output of an example that must succeed, run without its own process and Ray."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", str(tmp_path))
 
@@ -55,7 +55,7 @@ def test_a_restored_algorithm_continues(printed: Callable[..., str]) -> None:
 
 
 def test_tune_has_a_grid_over_q(printed: Callable[..., str], tmp_path: Path) -> None:
-    """With two trials instead of six, each of which starts a process."""
+    """Only two trials instead of six, because each starts a process."""
     text = (ROOT / "examples" / "tune_grid.py").read_text(encoding="utf-8")
     assert "[1.0, 1.5, 2.0]" in text
     fewer = text.replace("[1.0, 1.5, 2.0]", "[1.0, 2.0]").replace("[0, 1]", "[0]")

@@ -1,7 +1,7 @@
-"""A newcomer's first hour, in a folder that is not the repository's: a sweep without problems.
+"""A newcomer's first hour, in a folder outside the repository: a sweep without problems.
 
-README's sweep with a budget of seconds, what follows, and a finer sweep after it.
-tests/unit/test_snippets.py looks at all commands and snippets that are not run here; sweeps with
+README's sweep with a budget of seconds, the commands after it, and a finer sweep.
+tests/unit/test_snippets.py checks all commands and snippets that are not run here; sweeps with
 failures are in test_sweep_local.py.
 """
 
@@ -38,14 +38,14 @@ SECONDS = {
     "evaluation": {"interval": 150, "episodes": 2},
     "tac": {"random_steps": 200, "replay_ratio": 0.1},
 }
-# A server without accounts has nobody to name.
+# A server without accounts has no user names.
 HARMLESS = ("mlflow/users/current",)
 EXPECTED = re.compile(
     r"\[ *\d+:\d\d\] (q=|starting a local Ray$|best so far: (train )?q = )"
     r"|(stage|run|train|q=\S+)[ :/]|  |Sweep |Results |Storage: |3 runs, |"
     r"Report: |Picture: |Compare in MLflow: |Open MLflow's pages with: "
 )
-"""Lines of a sweep in which nothing goes wrong."""
+"""Lines that a sweep without problems prints."""
 
 
 def snippet(page: str, language: str, position: int = 0) -> str:
@@ -55,14 +55,14 @@ def snippet(page: str, language: str, position: int = 0) -> str:
 
 
 def said(main: Callable[[Sequence[str]], int], folder: Path, *arguments: str) -> str:
-    """What a command prints there; it must end well."""
+    """Output of a command in the newcomer's folder; it must succeed."""
     code, output, errors = call(main, folder, *arguments)
     assert code == 0, output + errors
     return output
 
 
 class Newcomer(NamedTuple):
-    """The newcomer's folder, what the sweep printed, and its MLflow."""
+    """The newcomer's folder, the sweep's output, and its MLflow."""
 
     folder: Path
     output: str
@@ -70,7 +70,7 @@ class Newcomer(NamedTuple):
     experiment_id: str
 
     def runs(self) -> dict[str, Any]:
-        """Those of the current plan, by name."""
+        """Runs of the current plan, by name."""
         wanted = f"tags.{names.TAG_CURRENT} = '{names.CURRENT}'"
         found = self.client.search_runs([self.experiment_id], wanted)
         return {run.info.run_name: run for run in found}
@@ -92,8 +92,8 @@ def newcomer(tmp_path_factory: pytest.TempPathFactory) -> Newcomer:
 
 
 def _run(folder: Path, report: str) -> str:
-    """What a user's sweep says that ends well."""
-    # A screen wide enough for the last columns of tables, and a user without settings of Ray.
+    """Output of the user's sweep, which succeeds."""
+    # A terminal wide enough for the last columns of tables, and a user without settings of Ray.
     user = {names.VARIABLE_REPORT: report, "COLUMNS": "160", "HOME": str(folder / "home")}
     environment = program_environment() | user
     del environment["RAY_AUTH_MODE"]
@@ -133,7 +133,7 @@ def test_the_screen_shows_the_plan_the_runs_and_their_results(newcomer: Newcomer
     assert {row[-1] for row in found} == {"finished"}
     assert all("300" in row for row in found)
     assert "mlflow ui --backend-store-uri" in output
-    # Ray by itself would have written a token file that changes later `ray start`s.
+    # Ray itself would have written a token file that changes later `ray start`s.
     assert not (newcomer.folder / "home" / ".ray").exists()
 
 
@@ -157,7 +157,7 @@ def test_mlflow_has_each_run_with_its_settings_curves_and_policy(newcomer: Newco
 
 
 def test_results_in_hand(newcomer: Newcomer, monkeypatch: pytest.MonkeyPatch) -> None:
-    """docs/reports.md as it stands, and the same out of the export."""
+    """The snippets of docs/reports.md on a storage, and with the same output on its export."""
     folder = newcomer.folder
     monkeypatch.chdir(folder)
     known: dict[str, Any] = {}
@@ -268,7 +268,7 @@ def test_a_finer_sweep_reuses_what_is_finished(
     assert len(runs) == 1 + 1 + 4, "and the sweep's own run of the coarser plan"
     check_frames(folder, tmp_path / "export")
 
-    # Under another name there is nothing to train, and MLflow gets all of it once more.
+    # Under another name all results are reused, and MLflow gets all of them again.
     monkeypatch.setenv("COLUMNS", "160")
     again = rows(said(sweep, folder, "run", "my_sweep.yaml", "--name", "other"))
     assert [row[-1] for row in again] == ["reused"] * 4
@@ -278,7 +278,7 @@ def test_a_finer_sweep_reuses_what_is_finished(
 
 
 def check_frames(folder: Path, export: Path) -> None:
-    """The same from the storage and from an export."""
+    """The same tables from the storage and from an export."""
     place = folder / "results" / "my_sweep"
     assert sweep(["report", str(place), "--export", str(export)]) == 0
     first, other = load_sweep(place), load_sweep(export)

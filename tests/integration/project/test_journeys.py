@@ -1,4 +1,4 @@
-"""The five journeys of docs/architecture.md, as traces show them."""
+"""The five journeys of docs/architecture.md match their traces."""
 
 from __future__ import annotations
 

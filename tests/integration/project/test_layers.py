@@ -43,7 +43,7 @@ def _is_in(module: str, part: str) -> bool:
 
 
 def test_imports_point_downwards() -> None:
-    """The contracts of pyproject.toml."""
+    """The contracts of pyproject.toml hold."""
     program = Path(sys.executable).with_name("lint-imports")
     done = subprocess.run(
         [program], cwd=PACKAGE.parent, capture_output=True, text=True, check=False
@@ -61,7 +61,7 @@ def _forbidden(module: str) -> list[str]:
 
 
 def test_lower_layers_load_no_ray() -> None:
-    """In one fresh process, the strictest first: what one module loads stays loaded."""
+    """In one fresh process, the strictest modules first, because imports remain loaded."""
     checked = {
         module: _forbidden(module)
         for module in MODULES
@@ -87,7 +87,7 @@ def test_lower_layers_load_no_ray() -> None:
 
 
 def test_a_driver_loads_only_what_it_needs() -> None:
-    """Each takes a third of a second or more, and memory for as long as the sweep lasts."""
+    """Each import takes at least a third of a second, and memory for the whole sweep."""
     never = ["torch", "scipy.stats", "matplotlib", "optuna"]  # optuna: without a search
     code = (
         "import sys\n"
@@ -104,7 +104,7 @@ def test_a_driver_loads_only_what_it_needs() -> None:
 
 
 def test_a_run_begins_without_torchs_compiler() -> None:
-    """It would take a second and 70 MB in each process; seeds and optimizers of torch load it."""
+    """It would take a second and 70 MB in each process; torch's seeds and optimizers load it."""
     code = (
         "import sys, torch\n"
         "from ray.rllib.utils.torch_utils import set_torch_seed\n"
@@ -123,6 +123,6 @@ def test_a_run_begins_without_torchs_compiler() -> None:
 
 
 def test_the_rules_name_what_exists() -> None:
-    """A rule about a module that was renamed would hold nothing."""
+    """A rule about a renamed module would check nothing."""
     for part in (*PURE, *LIGHT, *MAY_LOAD_RAY):
         assert any(_is_in(module, part) for module in MODULES) or part == "", part

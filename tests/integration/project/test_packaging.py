@@ -1,4 +1,4 @@
-"""The package as a stranger gets it: the wheel, a bare import, the exact versions."""
+"""The package as a user gets it: the wheel, a bare import, the exact versions."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def _run_python(
 
 
 def _tracked() -> list[str]:
-    """The repository's files; of an unpacked source distribution all that are not caches."""
+    """The repository's files; in an unpacked source distribution, all files except caches."""
     found = subprocess.run(
         ["git", "ls-files", "--cached", "--others", "--exclude-standard"],
         cwd=ROOT,
@@ -65,12 +65,12 @@ def _tracked() -> list[str]:
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of both, built from a copy (setuptools leaves files behind), without a network."""
+    """Folder with both, built without a network from a copy (setuptools leaves files behind)."""
     source = tmp_path_factory.mktemp("source")
     for name in _tracked():
         (source / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / name, source / name)
-    # The wheel is built from the source distribution, as an installer does it.
+    # As an installer does, build the wheel from the source distribution.
     done = _run_python("-W", "ignore", "-m", "build", "--no-isolation", cwd=source)
     assert done.returncode == 0, done.stdout + done.stderr
     return source / "dist"
@@ -126,7 +126,7 @@ def test_wheel_installs_the_command(unpacked: Path) -> None:
 
 
 def test_wheel_alone_plans_its_default_sweep(unpacked: Path, tmp_path: Path) -> None:
-    """Without a file the program uses a default that must have travelled in the wheel."""
+    """Without a file the program uses a default, which the wheel must contain."""
     shown = _run_python("-m", "music_rllib", "plan", "preset=small", cwd=tmp_path, path=unpacked)
     assert shown.returncode == 0, shown.stdout + shown.stderr
     assert "FetchReach" in shown.stdout
@@ -181,7 +181,7 @@ def test_every_constraint_is_one_exact_version() -> None:
     for requirement in _constraints().values():
         (specifier,) = requirement.specifier
         assert specifier.operator == "==", requirement
-        # A wildcard is no exact version; a local label (+cpu) or a URL binds to one index.
+        # A wildcard is not an exact version; a local label (+cpu) or a URL depends on one index.
         assert "*" not in specifier.version, requirement
         assert Version(specifier.version).local is None, requirement
         assert requirement.url is None, requirement
@@ -205,13 +205,13 @@ def _requirements_of(name: str, extras: set[str]) -> Iterator[Requirement]:
             yield requirement
 
 
-# Of the `bench` extra, which is installed with `make bench`: its own needs cannot be looked up.
+# Part of the `bench` extra, installed by `make bench`: its dependencies cannot be looked up.
 NOT_IN_THE_TESTS = {"sbx-rl", "stable-baselines3", "furo", "myst-parser", "sphinx"}
-"""Of `make bench` and `make docs`, which install them."""
+"""Packages that `make bench` and `make docs` install."""
 
 
 def test_constraints_pin_everything_that_is_pulled_in() -> None:
-    """Whatever the declared dependencies need, at any depth, has its exact version."""
+    """All direct and indirect dependencies have an exact version."""
     constraints = _constraints()
     queue = _direct_requirements()
     seen: set[tuple[str, frozenset[str]]] = set()

@@ -97,7 +97,7 @@ SEARCHES = [
         ],
     }
 ]
-"""As `search.json` has it."""
+"""The search, as in `search.json`."""
 FAILED = 3
 """Position of the run that failed."""
 FAILURE = "ValueError: the <simulation> broke"
@@ -127,7 +127,7 @@ def nodes(tmp_path_factory: pytest.TempPathFactory) -> list[Node]:
 
 @pytest.fixture(scope="module")
 def sweep_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A sweep of two stages; of its six runs one failed and the last has not begun."""
+    """A sweep of two stages; one of its six runs failed, and the last one has not started."""
     storage = tmp_path_factory.mktemp("results")
     file = storage / "tiny.yaml"
     file.write_text(CONFIG)
@@ -161,7 +161,7 @@ def sweep_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def searched(sweep_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An export of the same sweep that has the results of a search, too."""
+    """An export of the same sweep that also has the results of a search."""
     folder = tmp_path_factory.mktemp("searched")
     sweep = read_sweep(str(sweep_folder)).sweep
     write_archive(dataclasses.replace(sweep, searches=SEARCHES), folder)
@@ -170,7 +170,7 @@ def searched(sweep_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 @pytest.fixture(scope="module")
 def page(sweep_folder: Path) -> Path:
-    """The report that the command makes where neither Ray nor MLflow can be imported."""
+    """The report of the command in an environment without Ray and MLflow."""
     code = (
         "import sys; sys.modules['ray'] = sys.modules['mlflow'] = None\n"
         "from music_rllib.program import main; sys.exit(main(['report', *sys.argv[1:]]))"
@@ -198,7 +198,7 @@ def run(*arguments: str | Path) -> Result:
 
 
 def check_content(sweep: Sweep, nodes: list[Node]) -> None:
-    """Check that the sweep has everything that was reported, and nothing else."""
+    """Check that the sweep has exactly the reported results."""
     begun = [run for run in sweep.runs if run.status != "SCHEDULED"]
     assert [record.node_key for record in begun] == [node.key for node in nodes[:-1]]
     assert [record.status for record in begun[FAILED:]] == ["FAILED", "FINISHED"]
@@ -257,7 +257,7 @@ def test_an_export_of_another_sweep_is_not_replaced(sweep_folder: Path, tmp_path
     for options in ((), ("--add",)):
         refused = run(sweep_folder, "--export", exported, *options)
         assert (refused.exit_code, "it has 'other', not 'tiny'" in refused.stderr) == (2, True)
-    (exported / "runs.parquet").unlink()  # as an interrupted export leaves it
+    (exported / "runs.parquet").unlink()  # like an interrupted export
     assert run(sweep_folder, "--export", exported, "--add").exit_code == 2
     assert run(sweep_folder, "--export", exported).exit_code == 0
     assert read_archive(exported).name == "tiny"
@@ -288,7 +288,7 @@ def test_the_report_of_an_export_has_the_same_tables(
     for name in ("final", "runs", "curves"):
         tables = (page.parent, exported / "report")
         one, other = ((folder / "tables" / f"{name}.csv").read_text() for folder in tables)
-        # An export has only the runs that have begun.
+        # An export only has runs that have started.
         assert [line for line in one.splitlines() if ",waiting," not in line] == other.splitlines()
 
 
@@ -297,7 +297,7 @@ def test_a_sweep_that_does_not_exist_or_fit_is_refused(sweep_folder: Path, tmp_p
     assert other.exit_code == 2
     assert "SWEEP must be a sweep that was started, got other" in other.stderr
     assert "(sweeps there: tiny)" in other.stderr
-    # A folder is not the name of a sweep in the storage.
+    # A folder does not name a sweep in the storage.
     for place in (f"{tmp_path}/tiny", "..", "~nobody-at-all/tiny"):
         nowhere = run(place, "--storage", sweep_folder.parent)
         assert (nowhere.exit_code, nowhere.stderr.startswith("error: ")) == (2, True)

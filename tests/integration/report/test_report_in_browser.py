@@ -32,7 +32,7 @@ from tests.unit.report.test_page import SCRIPT, hostile
 
 DATA = Path(__file__).parents[3] / "docs" / "results" / "data"
 LOOK = Path(__file__).with_name("look.js").read_text()
-"""Finds text of figures that is cut or too faint, and controls without a name."""
+"""Finds truncated or low-contrast text in figures, and controls without a name."""
 AXE = Path(axe_core_python.__file__).with_name("axe.min.js").read_text()
 """Deque's checks of accessibility: contrast, names, roles, order of headings."""
 VIOLATIONS = """axe.run().then((found) => found.violations.map(
@@ -96,7 +96,7 @@ def test_the_page_is_readable_in_every_size_light_and_dark(
                 await drawn(tab, page)
                 await tab.evaluate("[...pending.keys()].forEach(drawNow)")
                 seen.append((width, await tab.evaluate(LOOK)))
-                if dark or width == 400:  # seconds each; LOOK has the rest
+                if dark or width == 400:  # takes seconds; LOOK checks the rest
                     await tab.evaluate(AXE)
                     assert await tab.evaluate(VIOLATIONS) == []
                 name = "-dark" if dark else "" if width == 1400 else f"-{width}"
@@ -220,7 +220,7 @@ def test_print_and_pages_without_script_have_all_figures(
 
 
 def test_a_script_in_a_sweep_does_not_run(open_page: Callable[[], Page], tmp_path: Path) -> None:
-    """Neither escaped text nor, thanks to the policy of the page, injected text runs."""
+    """Neither escaped text nor injected text runs, thanks to the page's policy."""
     page = render(build_report(hostile()))
     bare = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", page)
     injected = f"{SCRIPT[2:]}--><img src=http://127.0.0.1:9/x.png></body>"
@@ -252,7 +252,7 @@ def test_a_script_in_a_sweep_does_not_run(open_page: Callable[[], Page], tmp_pat
 def serve(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[Callable[[Callable[[], str]], str]]:
-    """Serves the page of the sweep `tiny`, and gives its address."""
+    """Serves the page of the sweep `tiny`; yields its address."""
     monkeypatch.setattr(live, "LEAST_PAUSE", 0.2)
     monkeypatch.setattr(live, "PAUSE_FACTOR", 1.0)
     place, opened = SweepLocation(storage=str(tmp_path), name="tiny"), ExitStack()
@@ -307,7 +307,7 @@ def test_the_live_page_updates_in_place(
 def test_the_live_page_of_a_study_half_way(
     open_page: Callable[[], Page], serve: Callable[[Callable[[], str]], str], tmp_path: Path
 ) -> None:
-    """FetchPush on fresh seeds as it was when half of its runs had ended."""
+    """FetchPush on fresh seeds, at the time when half of its runs had ended."""
     whole = read_archive(DATA / "claims-push")
     sweep = as_of(whole, sorted(run.ended or 0 for run in whole.runs)[len(whole.runs) // 2])
     running = [i for i, run in enumerate(sweep.runs) if run.status == "RUNNING"]
@@ -353,7 +353,7 @@ def test_the_live_page_of_a_study_half_way(
 
 
 def as_of(sweep: Sweep, time: int) -> Sweep:
-    """What there was of it at a time, in ms since the epoch."""
+    """The part of it that existed at a time, in ms since the epoch."""
     begun = [i for i, run in enumerate(sweep.runs) if (run.started or 0) < time]
     history = {}
     for metric, column in sweep.history.items():

@@ -34,12 +34,12 @@ ROOT = Path(__file__).parents[3]
 
 
 WORTH = names.ALPHA
-"""What a trial is worth: a metric that says its alpha, so that it is sure which one is stopped."""
+"""Value of a trial: a metric that depends on its alpha, so that the stopped trial is known."""
 STOPPED = 3
 
 
 def searched(sweep_document: Document) -> Document:
-    """A search over very short runs; trial 3 is the worst by far of those before it."""
+    """A search with very short runs; trial 3 is by far the worst of the first four."""
     sweep_document["seeds"] = [0, 1, 2]
     sweep_document["defaults"] |= {
         "env_steps": 400,
@@ -71,7 +71,7 @@ def searched(sweep_document: Document) -> Document:
 
 
 PATIENCE = 1500
-"""Seconds that a command may take on a busy machine."""
+"""Timeout of a command on a busy machine, in seconds."""
 
 
 def command(program: Any, *arguments: str) -> tuple[int, str, str]:
@@ -106,7 +106,7 @@ def test_a_search_stopped_and_resumed_and_what_its_commands_say(
     state = json.loads(output)
     assert state["driver"]["outcome"] == "finished"
     check_search(sweep_program.folder / "results")
-    # Never interrupted, and with no run to reuse: the same study, and the same numbers in each run.
+    # An uninterrupted search without runs to reuse has the same study and the same numbers.
     code, _, errors = command(sweep_program, "sweep.yaml", "--storage", "unbroken")
     assert code == 0, errors
     resumed, whole = (
@@ -124,7 +124,7 @@ def test_a_search_stopped_and_resumed_and_what_its_commands_say(
 
 
 def check_search(storage: Path) -> None:
-    """Every objective is the mean of what its runs have in the store."""
+    """Every objective is the mean over its runs in the store."""
     (found,) = json.loads((storage / "points/search.json").read_text())
     plan = json.loads((storage / "points/plan.json").read_text())
     labels = {node["label"]: node["key"] for node in plan["nodes"]}
@@ -174,7 +174,7 @@ def check_commands(program: Any) -> None:
 
 @pytest.fixture
 def postgresql(require_service: Callable[[str], Path], tmp_path: Path) -> Iterator[str]:
-    """A server of its own, on a free port of loopback; its URL."""
+    """URL of a new server on a free port of loopback."""
     programs = require_service("postgresql").resolve().parent
     programs = programs if (programs / "initdb").exists() else postgresql_programs()
     folder = tmp_path / "postgresql"

@@ -43,7 +43,7 @@ from tests.played_search import SPACE, Document, Driver, document, points, searc
 
 @pytest.fixture
 def tmp_path(tmp_path: Path) -> Iterator[Path]:
-    """In memory where that can be: a study is written in hundreds of small transactions."""
+    """In memory where possible: a study is written in hundreds of small transactions."""
     memory = Path("/dev/shm")
     if not memory.is_dir():
         yield tmp_path
@@ -66,7 +66,7 @@ def test_the_objective_is_the_aggregate_of_the_trials_runs(tmp_path: Path) -> No
         assert {run.seed for run in mine} == {0, 1, 2}
         results = [driver.sweep.store.result(run.key) for run in mine]
         values = sorted(result.metrics[names.EVAL_SUCCESS] for result in results if result)
-        # Three values: a quarter of them is less than one, so none is cut off.
+        # Three values: a quarter of them is less than one, so none is excluded.
         assert trial["objective"] == [pytest.approx(sum(values) / 3, abs=1e-12)]
         assert driver.sweep.plan.node(mine[0].key).run.tac.alpha == trial["values"]["tac.alpha"]
     best = max(trials, key=lambda trial: float(trial["objective"][0]))
@@ -75,7 +75,7 @@ def test_the_objective_is_the_aggregate_of_the_trials_runs(tmp_path: Path) -> No
 
 def test_the_event_of_its_last_run_scores_a_trial(tmp_path: Path) -> None:
     driver = Driver(tmp_path, document({"trials": 1}, seeds=[0]))
-    driver.play(stop_after=2)  # the pretraining and the run: no further run is asked for
+    driver.play(stop_after=2)  # the pretraining and the run; no further run is proposed
     assert [trial["state"] for trial in driver.trials()] == ["judged"]
 
 
@@ -119,7 +119,7 @@ def test_a_trial_that_another_driver_has_ended_is_left_to_it(
     shared = document({"storage": f"sqlite:///{tmp_path}/x.db", "study": "q"}, seeds=[0])
     one, other = (Driver(tmp_path, shared | {"name": name}) for name in ("a", "b"))
     mine, theirs = (driver.controller.searches[0].studies[0] for driver in (one, other))
-    theirs.trials()  # as they are before the first one is ended
+    theirs.trials()  # their state before the first one ends
     first = mine.claim()
     assert first is not None
     mine.end(first, TrialState.COMPLETE, [0.5], "")
@@ -199,7 +199,7 @@ def test_a_resumed_study_equals_the_uninterrupted_one(search: Document, tmp_path
         (tmp_path / folder).mkdir()
     whole = searched(tmp_path / "whole", search)
     for attempt in range(40):
-        # A killed driver leaves its trials as they are.
+        # A killed driver leaves its trials unchanged.
         driver = Driver(tmp_path / "broken", document(search), seed=attempt + 1)
         driver.play(stop_after=9)
         if driver.controller.over:
@@ -303,7 +303,7 @@ def test_a_trial_is_stopped_early_for_a_reason_and_costs_less(tmp_path: Path) ->
 
 def test_the_ranking_is_of_fresh_seeds(tmp_path: Path) -> None:
     def lucky(run: RunSettings, share: float) -> float:
-        """Good on the seeds of the search only."""
+        """The trial that is good on the seeds of the search only."""
         q = float(run.tac.entropic_index)  # type: ignore[arg-type]
         if q == 2.5 and run.seed < FINAL_SEED:
             return 0.99 * share
@@ -400,7 +400,7 @@ LOWEST: Document = {
 def test_best_and_status_rank_as_the_search_does(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Without a final ranking, with a minimized objective, and a trial that is half finished."""
+    """Without a final ranking, with a minimized objective, and with an unfinished trial."""
 
     def formula(run: RunSettings, share: float) -> float:
         lucky = run.tac.entropic_index == 2.5
@@ -443,7 +443,7 @@ def test_the_best_is_the_first_on_fresh_seeds_once_the_ranking_is_there(
     place = str(tmp_path / "results/s")
     best = answered(capsys, "status", place)["best"]
     chosen = answered(capsys, "best", place, "--output", str(tmp_path / "out"))
-    # 2.5 was the lowest in the search; of the two that were ranked 2.0 is lower on fresh seeds.
+    # 2.5 was the lowest in the search; of the two ranked trials, 2.0 is lower on fresh seeds.
     for found in (best, chosen):
         assert found["values"] == {"tac.entropic_index": 2.0}
         assert found["on_fresh_seeds"]
@@ -468,7 +468,7 @@ def test_compare_gives_every_value_the_same_budget_and_seeds(tmp_path: Path) -> 
     ]
     for arm in found["arms"]:
         assert [trial["state"] for trial in arm["trials"]] == ["judged"] * 4
-    # The same sampler's seed: all begin with the same point.
+    # The same seed of the sampler: all start with the same point.
     first = {arm["trials"][0]["values"]["tac.alpha"] for arm in found["arms"]}
     assert len(first) == 1
     by_q: dict[float, set[int]] = {}
@@ -523,7 +523,7 @@ def test_settings_of_the_pretraining_can_be_searched_and_are_shared(tmp_path: Pa
 
 
 def play_in_turns(*drivers: Driver) -> None:
-    """Until the search is over for all of them."""
+    """Wait until the search is over for all drivers."""
     for _ in range(200):
         for driver in drivers:
             try:
@@ -589,7 +589,7 @@ def test_two_drivers_share_a_study(tmp_path: Path) -> None:
 def test_two_drivers_of_one_sweep_share_its_runs(
     study: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Drivers on two machines with a bucket have a study each, with the same trials."""
+    """Drivers on two machines with a bucket have separate studies with the same trials."""
     search = {"trials": 5, "concurrent": 2, "final": {"trials": 1, "seeds": 2}}
     alone = searched(tmp_path / "alone", search, seeds=[0, 1])
     drivers = []
@@ -621,7 +621,7 @@ def test_a_dead_drivers_trials_are_taken_over(
     mine = driver.controller.searches[0].studies[0]
     mine.release_the_dead()
     assert [t.number for t in mine.trials() if t.state.name == "RUNNING"] == held, "it is alive"
-    # A fast clock has dated its heartbeat ahead, and it is dead.
+    # It is dead, and a fast clock has dated its heartbeat ahead.
     name, ahead = f"driver:{study._me}", time.time() + 3600
     mine._storage.set_study_user_attr(mine._id, name, ahead)
     mine.release_the_dead()

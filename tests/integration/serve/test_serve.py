@@ -73,7 +73,7 @@ def act(service: Service, body: Any, token: str = TOKEN) -> requests.Response:
 
 
 def test_actions_are_the_policys(service: Service) -> None:
-    """Requests of one and of many rows, side by side, so that they are computed together."""
+    """Requests of one and of many rows at the same time, so that they are computed together."""
     rng = np.random.default_rng(1)
 
     def ask(rows: int) -> None:
@@ -104,7 +104,7 @@ def test_the_token_is_needed_and_kept_out_of_sight(service: Service) -> None:
     assert requests.get(f"{service.url}/policy", timeout=60).status_code == 401
     health = requests.get(f"{service.url}/health", timeout=60)
     assert health.json() == {"status": "ok", "task": "FetchPush"}
-    # What Ray notes of this session: arguments of deployments, environments, logs.
+    # Files of Ray for this session: arguments of deployments, environments, logs.
     folder = ray_parent()
     # An older one may have had the same process id.
     session = max(folder.glob(f"{RAY_FOLDER}*/r/session_*_{service.process.pid}"))
@@ -115,12 +115,12 @@ def test_the_token_is_needed_and_kept_out_of_sight(service: Service) -> None:
 
 
 def test_a_storm_is_answered_or_asked_to_come_again(service: Service) -> None:
-    """Stalled requests hold a place for some seconds only; Serve's own health check answers."""
+    """Stalled requests occupy a place only for seconds; Serve's own health check answers."""
     with half_sent(service.url, 60) as clients:
         seen = asyncio.run(storm(service.url, service.policy, 600, TOKEN))
         for client in clients:
             client.settimeout(60)
-            # 503 if too many others waited when it came.
+            # 503 if too many others waited when it arrived.
             assert client.recv(65536).startswith((b"HTTP/1.1 408 ", b"HTTP/1.1 503 "))
     assert seen.count(200, 408, 503) == 600  # 408 if this machine takes longer than 10 s
     assert seen.count(200) >= 32
@@ -129,23 +129,23 @@ def test_a_storm_is_answered_or_asked_to_come_again(service: Service) -> None:
 
 
 def test_nothing_of_it_listens_beyond_loopback(service: Service) -> None:
-    """Neither the service, which was asked for loopback, nor Ray, with its `/metrics`."""
+    """Neither the service nor Ray with its `/metrics` listens beyond loopback."""
     places = listening(service.process)
     assert "raylet" in set.union(*places.values())
     assert all(ip_address(place.removeprefix("::ffff:")).is_loopback for place in places), places
 
 
 def fuzz(url: str, token: str, folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
-    """schemathesis as one starts it, on everything that the OpenAPI document lists.
+    """schemathesis as a user starts it, on the whole OpenAPI document.
 
-    Left out is the check that whatever fits the document is accepted: that the parts of a batch
-    have the same number of rows can't be said in JSON Schema.
+    Without the check that every valid request is accepted: JSON Schema cannot express that the
+    parts of a batch must have the same number of rows.
     """
     command = [
         *(str(Path(sys.executable).with_name("schemathesis")), "run", f"{url}/openapi.json"),
         *("--header", f"Authorization: Bearer {token}"),
         *("--checks", "all", "--exclude-checks", "positive_data_acceptance"),
-        # On a busy machine it would find its own generation of data too slow.
+        # On a busy machine it would consider its own generation of data too slow.
         *("--seed", "1", "--no-color", "--suppress-health-check", "too_slow"),
         *("--generation-database", "none", *options),
     ]
@@ -162,7 +162,7 @@ def test_fuzzing_the_application_finds_no_server_error(tmp_path: Path) -> None:
 
 
 def test_fuzzing_the_service_finds_no_server_error(service: Service, tmp_path: Path) -> None:
-    """Without the cases for coverage, which the application has passed: what Serve adds."""
+    """Without the phase `coverage`, which the application has passed: this tests Serve's part."""
     options = ("--phases", "examples,fuzzing", "--max-examples", "25")
     done = fuzz(service.url, TOKEN, tmp_path, *options)
     assert done.returncode == 0, done.stdout + done.stderr

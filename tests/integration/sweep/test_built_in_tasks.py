@@ -1,4 +1,4 @@
-"""Every built-in task against its environment, and training in a task without Fetch's robot.
+"""Every built-in task compared with its environment, and training without Fetch's robot.
 
 These are the checks that docs/add_an_environment.md describes.
 """
@@ -115,7 +115,7 @@ def test_split_entries_are_the_agent_and_the_object(task: Task, env: Env) -> Non
 
 
 def play(env: Env, seed: int, goal: Floats | None = None) -> tuple[Trajectory, list[float]]:
-    """An episode towards the object with noise, and the success of its steps.
+    """An episode towards the object with noise; returns the success of its steps.
 
     Args:
         goal: replaces the goal of the environment.

@@ -1,4 +1,4 @@
-"""`evaluate`: a run's policy plays episodes, is counted and filmed."""
+"""`evaluate`: a run's policy plays episodes, which are counted and recorded as videos."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ REACH = BUILT_IN_TASKS["FetchReach"]
 def policy_file(
     path: Path, task: Task, weight: np.ndarray[Any, Any], goal_size: int, high: float = 1.0
 ) -> Path:
-    """A policy of one layer; `about` is what a run's own has."""
+    """A policy of one layer; `about` has the metadata of a run's policy."""
     actions, inputs = weight.shape
     network = PolicyNetwork(
         weights=(weight.astype(np.float32),),
@@ -162,7 +162,7 @@ def test_a_film_shows_the_counted_episodes(good: Path) -> None:
 def test_an_environment_with_a_size_and_bounds_of_its_own_is_filmed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its name is like those of MuJoCo's; a saturated action is .1 in float32, which is more."""
+    """Its name resembles MuJoCo's; a saturated action is 0.1 in float32, which is larger."""
     monkeypatch.syspath_prepend(ENVIRONMENTS)
     task = Task(name="Mine", env_id="point_env:HandOver-v0", horizon=20)
     weight = np.full((2, 6), 100.0)
@@ -187,8 +187,8 @@ def test_the_files_are_videos(tmp_path: Path, ending: str) -> None:
 def test_no_driver_is_said_with_what_to_install(
     good: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """With a way of drawing that this machine has not."""
-    make_env(REACH.env_id).close()  # MuJoCo is loaded; by the test below it is not
+    """With a renderer that this machine does not have."""
+    make_env(REACH.env_id).close()  # here MuJoCo is loaded, in the next test it is not
     monkeypatch.setenv("MUJOCO_GL", "osmesa" if find_renderer()[0] != "osmesa" else "glfw")
     if find_renderer("osmesa")[0] is not None:
         pytest.skip("every way of drawing works here")
@@ -201,8 +201,8 @@ def test_no_driver_is_said_with_what_to_install(
 
 
 def test_a_fresh_process_says_that_mujoco_does_not_load_with_a_way_of_drawing(good: Path) -> None:
-    """Only loading it looks at the variable, and PyOpenGL's error does not name it."""
-    # MuJoCo sets the other one in a process that has drawn: it would be obeyed.
+    """Only loading MuJoCo reads the variable, and PyOpenGL's error does not name it."""
+    # MuJoCo sets the other variable in a process that has rendered; it would be used.
     inherited = {key: text for key, text in os.environ.items() if key != "PYOPENGL_PLATFORM"}
     if find_renderer("osmesa")[0] is not None:
         pytest.skip("osmesa works here")

@@ -1,4 +1,4 @@
-"""A run with more `env_steps` goes on where the finished shorter one has ended."""
+"""A run with more `env_steps` resumes from the end of the finished shorter one."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.integration.sweep.test_sweep_trainable import (
     settings,
 )
 
-__all__ = ["nothing_in_the_home_folder", "point_environment"]  # fixtures that go by themselves
+__all__ = ["nothing_in_the_home_folder", "point_environment"]  # automatic fixtures
 
 pytestmark = pytest.mark.integration
 
@@ -49,7 +49,7 @@ def test_a_longer_run_goes_on_and_ends_with_the_numbers_of_an_unbroken_one(
     files = [Path(NodeStore(str(tmp_path / one)).path(longer.key), "handoff") for one in "ab"]
     for array in files[0].rglob("*.safetensors"):
         assert array.read_bytes() == (files[1] / array.relative_to(files[0])).read_bytes()
-    # One checkpoint, of the longest; a shorter run that comes later doesn't replace it.
+    # One checkpoint, of the longest run; a later shorter run does not replace it.
     kept = store.continuation(continuation_key(longer.run, None))
     (name,) = kept.names()
     compute(job(tmp_path / "b", settings(variant, env_steps=800)))
@@ -146,6 +146,6 @@ def test_what_spans_the_budget_is_named(changes: dict[str, Any], spans: list[str
 def test_an_end_that_only_the_budget_asks_for_is_none_to_go_on_from(
     env_steps: int, interval: int, even: bool
 ) -> None:
-    """A longer run has no evaluation, or no report, where the budget of this one ends."""
+    """A longer run has no evaluation, or no report, at the end of this run's budget."""
     evaluation = {"interval": interval, "episodes": 2}
     assert is_continuable(settings("tac", env_steps=env_steps, evaluation=evaluation)) == even

@@ -131,7 +131,7 @@ for kind in (Loud, Aborts, Ends, Stops, Raises):
 def test_an_environment_that_ends_its_process_is_named_and_the_others_are_played(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each would end the driver."""
+    """Each of them would end the driver."""
     (tmp_path / "fatal_env.py").write_text(FATAL)
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.syspath_prepend(str(ENVIRONMENTS))

@@ -1,4 +1,4 @@
-"""The same program on a cluster: by `RAY_ADDRESS`, and as a submitted job."""
+"""The same program on a cluster: with `RAY_ADDRESS`, and as a submitted job."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ BIN = Path(sys.executable).parent
 
 TOKEN = "planted-" + "0123456789abcdef" * 3
 STOP = {"RAY_JOB_STOP_SIGNAL": "SIGINT", "RAY_JOB_STOP_WAIT_TIME_S": "60"}
-"""What the guide tells to put into the runtime environment of jobs."""
+"""The guide's settings for the runtime environment of jobs."""
 
 
 class Head(NamedTuple):
@@ -47,19 +47,19 @@ class Head(NamedTuple):
 
     @property
     def home(self) -> Path:
-        """Of the user whom the cluster belongs to."""
+        """Home folder of the cluster's user."""
         return Path(self.environment["HOME"])
 
 
 def ray_start(
     folder: Path, environment: dict[str, str], cpus: int, *options: str
 ) -> subprocess.Popen[Any]:
-    """A node; ends with its process, which is `--block`."""
+    """A node; it ends with its process, which uses `--block`."""
     command = [str(BIN / "ray"), "start", "--block", f"--num-cpus={cpus}"]
     common = [
         "--disable-usage-stats",
         "--node-ip-address=127.0.0.1",
-        # Takes the jobs; its default port may belong to another Ray on this machine.
+        # Accepts jobs; its default port may belong to another Ray on this machine.
         f"--dashboard-agent-listen-port={free_port()}",
     ]
     with (folder / "log").open("a") as log:
@@ -73,13 +73,13 @@ def ray_start(
 
 
 def without_loopback_only() -> dict[str, str]:
-    """The environment without what a sweep in this process has set for its local Ray."""
+    """The environment without the variables that a sweep in this process set for its local Ray."""
     return {k: v for k, v in os.environ.items() if k != LOCAL_RAY_BEYOND_LOOPBACK}
 
 
 @contextlib.contextmanager
 def head_node(home: Path, cpus: int, workers: Sequence[int] = ()) -> Iterator[Head]:
-    """A head that asks for a token, and further nodes, all with this home folder."""
+    """A head that requires a token, and further nodes, all with this home folder."""
     port, dashboard = free_port(), free_port()
     # Not pytest's folder: Ray's sockets need a short path.
     folder = Path(tempfile.mkdtemp(prefix="ray"))
@@ -98,7 +98,8 @@ def head_node(home: Path, cpus: int, workers: Sequence[int] = ()) -> Iterator[He
     try:
         wait_for_jobs(head)
         for number, more in enumerate(workers):
-            # With one folder for both, a node deletes a job's files that the other one uses.
+            # With one folder for both, a node would delete a job's files while another one uses
+            # them.
             options = [f"--address={address}", f"--temp-dir={folder / f'ray{number}'}"]
             nodes.append(ray_start(folder, environment, more, *options))
         wait_for_nodes(head, len(nodes))
@@ -130,7 +131,7 @@ def request(head: Head, path: str, body: Any = None) -> Any:
 
 
 def wait_for_jobs(head: Head) -> None:
-    """Until the dashboard and the agent behind it take jobs."""
+    """Wait until the dashboard and its agent accept jobs."""
     for _ in range(240):
         try:
             request(head, "/api/jobs/", {"entrypoint": "true"})
@@ -143,7 +144,7 @@ def wait_for_jobs(head: Head) -> None:
 
 
 def wait_for_nodes(head: Head, count: int) -> None:
-    """Until so many nodes are alive."""
+    """Wait until `count` nodes are alive."""
     for _ in range(240):
         alive = request(head, "/nodes?view=summary")["data"]["summary"]
         if sum(node["raylet"].get("state") == "ALIVE" for node in alive) == count:
@@ -162,7 +163,7 @@ def small(document: dict[str, Any]) -> dict[str, Any]:
 def start_sweep(
     head: Head, document: dict[str, Any], folder: Path, command: str = "run"
 ) -> subprocess.Popen[str]:
-    """With `RAY_ADDRESS`, from a folder of the user's, which has the environment's module."""
+    """With `RAY_ADDRESS`, from the user's folder, which contains the environment's module."""
     (folder / "sweep.yaml").write_text(yaml.safe_dump(document, sort_keys=False))
     shutil.copy(ENVIRONMENTS / "point_env.py", folder)
     return subprocess.Popen(
@@ -178,7 +179,7 @@ def start_sweep(
 def run_sweep(
     head: Head, document: dict[str, Any], folder: Path, command: str = "run"
 ) -> subprocess.CompletedProcess[str]:
-    """`start_sweep` to its end."""
+    """Run `start_sweep` to its end."""
     with start_sweep(head, document, folder, command) as process:
         output, errors = process.communicate(timeout=280)
     return subprocess.CompletedProcess(process.args, process.returncode, output, errors)
@@ -187,7 +188,7 @@ def run_sweep(
 def test_more_cpus_than_any_node_has(
     head: Head, sweep_document: dict[str, Any], tmp_path: Path
 ) -> None:
-    """Together the nodes have two, but a run is on one of them."""
+    """Both nodes together have two, but a run needs one node."""
     sweep_document["resources"] = {"cpus_per_run": 2}
     done = run_sweep(head, sweep_document, tmp_path)
     assert done.returncode == 2, done.stderr
@@ -198,7 +199,7 @@ def test_more_cpus_than_any_node_has(
 
 
 FAKE_HEAD = "f" * 51 + "00000"
-"""Node id by which Ray's provider of make-believe nodes knows the head."""
+"""Node id of the head for Ray's provider of simulated nodes."""
 
 
 COMMANDS = (
@@ -206,18 +207,18 @@ COMMANDS = (
     *("head_start_ray_commands", "worker_start_ray_commands", "cluster_synced_files"),
     *("rsync_exclude", "rsync_filter"),
 )
-"""What the launcher's configuration must have, and is empty where nothing is launched."""
+"""Required keys of the launcher's configuration, empty because nothing is launched."""
 
 
 @contextlib.contextmanager
 def growing_head(folder: Path, home: Path) -> Iterator[Head]:
-    """A head with one CPU, whose autoscaler adds nodes with three, all of them processes here.
+    """A head with one CPU, whose autoscaler adds nodes with three, as processes of this machine.
 
-    `ray.cluster_utils.AutoscalingCluster` isn't used: it stops every Ray of the machine, and needs
-    a file that Ray's wheel doesn't have.
+    `ray.cluster_utils.AutoscalingCluster` is not used: it stops every Ray of the machine, and needs
+    a file that is not in Ray's wheel.
     """
     port = free_port()
-    # The nodes that are added are at this address, and so must be the head.
+    # Added nodes use this address, so the head must use it too.
     here = ray.util.get_node_ip_address()
     address = f"{here}:{port}"
     module = "ray.autoscaler._private.fake_multi_node.node_provider.FakeMultiNodeProvider"
@@ -258,7 +259,7 @@ def growing_head(folder: Path, home: Path) -> Iterator[Head]:
             time.sleep(0.2)
         yield Head(address, "", folder, environment, process)
     finally:
-        # Nobody ends what belongs to the added nodes when the autoscaler itself is gone.
+        # When the autoscaler itself has ended, nothing else ends the processes of added nodes.
         started = psutil.Process(process.pid).children(recursive=True)
         process.terminate()
         process.wait(timeout=60)
@@ -282,7 +283,7 @@ def test_a_cluster_grows_for_runs_that_no_node_of_it_could_hold(
 
 
 class Jobs:
-    """`ray job` as a user calls it, from a folder with the package in it and no installation."""
+    """Run `ray job` as a user does, from a folder with the package and without an installation."""
 
     def __init__(self, folder: Path, sweep: dict[str, Any]) -> None:
         self.folder = folder
@@ -291,7 +292,7 @@ class Jobs:
             folder / "music_rllib",
             ignore=shutil.ignore_patterns("__pycache__"),
         )
-        lab = folder / "lab"  # the module lies beside the sweep's file, not in the job's folder
+        lab = folder / "lab"  # the module is next to the sweep's file, not in the job's folder
         lab.mkdir()
         shutil.copy(ENVIRONMENTS / "point_env.py", lab)
         (lab / "sweep.yaml").write_text(yaml.safe_dump(sweep, sort_keys=False))
@@ -318,7 +319,7 @@ class Jobs:
         return self.call(head, "submit", *arguments, "--", *program, token=token)
 
     def wait_for_log(self, head: Head, job: str, wanted: str) -> str:
-        """The job's log when `wanted` is in it."""
+        """The job's log as soon as it contains `wanted`."""
         text = ""
         for _ in range(400):
             text = str(request(head, f"/api/jobs/{job}/logs")["logs"])
@@ -332,7 +333,7 @@ class Jobs:
 
 @dataclass(frozen=True)
 class Site:
-    """Where jobs run: their checkout, the file that lets their environment hurry, and a home."""
+    """Folder of jobs: their checkout, the file that makes their environment fast, and a home."""
 
     jobs: Jobs
     fast: Path
@@ -343,7 +344,7 @@ class Site:
         return self.home / "results"
 
     def stop_one(self, head: Any) -> str:
-        """A job that is stopped after its first checkpoint; its log."""
+        """Stop a job after its first checkpoint; returns its log."""
         assert self.jobs.submit(head, "one", wait=False).returncode == 0
         wait_for_newer(self.storage / "work", "")
         assert self.jobs.call(head, "stop", "one").returncode == 0
@@ -354,7 +355,7 @@ class Site:
         return log
 
     def finish(self, head: Any, runs: int = 1) -> str:
-        """A job that goes on to the end; its output."""
+        """Resume a job to its end; returns its output."""
         self.fast.touch()
         done = self.jobs.submit(head, "last")
         assert done.returncode == 0, done.stdout + done.stderr
@@ -393,9 +394,9 @@ def test_two_runs_on_two_nodes_are_stopped_and_a_job_finishes_them(
         "env_kwargs": {"folder": str(met), "fast": str(fast)},
     }
     document["seeds"] = [0, 1]
-    document["resources"] = {"memory_per_run": 0.05}  # so that Ray is asked before it begins, too
+    document["resources"] = {"memory_per_run": 0.05}  # so that Ray is also asked before it starts
     document["defaults"] |= {"env_steps": 2_000, "evaluation": {"interval": 200, "episodes": 1}}
-    # Updates would be compiled anew in the job's copy of the package.
+    # Otherwise updates would be compiled again in the job's copy of the package.
     document["defaults"]["tac"]["random_steps"] = 1_999
     site = Site(Jobs(tmp_path / "checkout", document), fast, head.home)
     document["storage"] = str(site.storage)
@@ -420,7 +421,7 @@ def test_two_runs_on_two_nodes_are_stopped_and_a_job_finishes_them(
 def test_job_is_stopped_then_outlives_its_cluster(
     sweep_document: dict[str, Any], tmp_path: Path
 ) -> None:
-    """Stopped in good order; resumed, and its head killed; resumed on a new cluster to its end."""
+    """Stopped in order; resumed, and its head killed; resumed on a new cluster to its end."""
     home = tmp_path / "home"
     home.mkdir()
     fast = tmp_path / "fast"
@@ -449,7 +450,7 @@ def test_job_is_stopped_then_outlives_its_cluster(
 
 
 def kill_tree(process: subprocess.Popen[Any]) -> None:
-    """All that the node has started, drivers and workers too, as when a machine is switched off."""
+    """Kill all processes that the node started, incl. drivers and workers, as a power cut does."""
     tree = psutil.Process(process.pid)
     for inner in [tree, *tree.children(recursive=True)]:
         with contextlib.suppress(psutil.NoSuchProcess):
@@ -458,7 +459,7 @@ def kill_tree(process: subprocess.Popen[Any]) -> None:
 
 
 def newest_checkpoint(work: Path) -> str:
-    """Its number, which grows with the environment steps; empty where there is none."""
+    """Name of the newest one, which grows with the environment steps; empty without one."""
     found = [path.parent.name for path in work.glob("*/*/manifest.json")]
     return max(found, default="")
 

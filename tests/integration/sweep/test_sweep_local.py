@@ -1,6 +1,6 @@
 """Sweeps with a local Ray that fail or are killed; tasks without success rates.
 
-One in which nothing goes wrong is in test_first_hour.py.
+A sweep without problems is in test_first_hour.py.
 """
 
 import json
@@ -60,7 +60,7 @@ PLANTED = {
 
 
 class Ended(NamedTuple):
-    """A sweep that has ended, and what it printed."""
+    """A sweep that has ended, and its output."""
 
     folder: Path
     server: str
@@ -75,10 +75,10 @@ class Ended(NamedTuple):
 
 @pytest.fixture(scope="module")
 def ended(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ended]:
-    """A sweep on two tasks without success, one of which fails in its 300th step.
+    """A sweep on two tasks without success; one of them fails in its 300th step.
 
-    Their module lies beside the file, in another folder than the current one, as do some with the
-    names of Python's own. MLflow is a server with a password.
+    Their module is next to the file, outside the current folder, as are modules with the names of
+    Python's own. MLflow is a server with a password.
     """
     folder = tmp_path_factory.mktemp("ended")
     program = Program(folder, program_environment(), "lab/sweep.yaml")
@@ -86,7 +86,7 @@ def ended(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ended]:
     shutil.copy(ENVIRONMENTS / "point_env.py", folder / "lab")
     for name in ("random", "types", "queue", "secrets"):
         (folder / "lab" / f"{name}.py").write_text("raise RuntimeError('not this one')")
-    # `python -m` finds modules in the current folder first, where `music-rllib` does not.
+    # `python -m` searches the current folder first, `music-rllib` does not.
     program.environment |= {"PYTHONPATH": str(REPOSITORY), "PYTHONSAFEPATH": "1"}
     program.environment[names.VARIABLE_REPORT] = "on"
     program.environment["POINT_SAYS"] = (
@@ -130,7 +130,7 @@ def test_a_failure_is_explained_and_the_others_finish(ended: Ended) -> None:
 
 
 def test_secrets_are_used_and_written_nowhere(ended: Ended) -> None:
-    """Passwords in variables and in what an environment said."""
+    """Passwords in variables and in an environment's message."""
     url = f"{ended.server}/api/2.0/mlflow/runs/search"
     wanted: Any = {"experiment_ids": ["1"], "max_results": 50}
     assert requests.post(url, json=wanted, timeout=60).status_code == 401
@@ -139,7 +139,7 @@ def test_secrets_are_used_and_written_nowhere(ended: Ended) -> None:
     for shown in (ended.output, found.text):
         assert "planted-" not in shown
     # The storage, the server's database, artifacts and log.
-    (settings,) = ended.folder.rglob("basic_auth.ini")  # the one place where MLflow takes it from
+    (settings,) = ended.folder.rglob("basic_auth.ini")  # the only place where MLflow reads it
     assert stat.S_IMODE(settings.stat().st_mode) == 0o600
     files = [path for path in ended.folder.rglob("*") if path.is_file()]
     assert [path for path in files if b"planted-" in path.read_bytes()] == [settings]
@@ -158,7 +158,7 @@ def test_tasks_without_success_show_their_return_from_the_first_line_to_the_repo
         assert names.EVAL_SUCCESS not in run.data.metrics
     report = folder / "results" / "points" / "report"
     page = (report / "report.html").read_text()
-    # The point has no picture: the page says so, instead of failing.
+    # The point cannot be rendered: the page explains it.
     assert "No videos: " in page
     assert "it has no rgb_array rendering" in page
     assert "Nothing was evaluated" not in page
@@ -183,7 +183,7 @@ def test_a_run_names_its_source_and_evaluate_finds_its_policy_by_label(
     tags = runs["q=1 seed 0 Point finetune"].data.tags
     assert tags[names.TAG_LABEL] == "finetune/Point/tac.entropic_index=1/seed0"
     assert tags[names.TAG_SOURCE_RUN] == runs["seed 0 Point pretrain"].info.run_id
-    # The policy's file names a module, which only the user may have imported.
+    # The policy's file names a module, which only the user may import.
     options = ["--episodes", "2", "--json", "--env", "point_env:Point-v0"]
     code, output, errors = call(main, ended.folder, "evaluate", tags[names.TAG_LABEL], *options)
     assert (code, errors) == (0, "")
@@ -202,10 +202,10 @@ class Paced(NamedTuple):
 
 @pytest.fixture(scope="module")
 def paced(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Paced]:
-    """A sweep of two runs, one at a time, at its 200th of 2,000 steps."""
+    """A sweep of two runs, one at a time, at step 200 of 2,000."""
     folder = tmp_path_factory.mktemp("paced")
     fast = folder / "fast"
-    # It does not end before the other driver has begun.
+    # It must not end before the other driver has started.
     kwargs = {"fast": str(fast), "after": 140, "seconds": 0.2}
     slow = POINT | {"env_id": "point_env:Paced-v0", "env_kwargs": kwargs}
     defaults = SWEEP["defaults"] | {

@@ -61,7 +61,7 @@ def point_environment() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def nothing_in_the_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Outside Tune, a trainable's folder would be made below the user's home."""
+    """Outside Tune, a trainable's folder would be created in the user's home."""
     monkeypatch.setattr(trainable, "DEFAULT_STORAGE_PATH", str(tmp_path))
 
 
@@ -216,7 +216,7 @@ def test_a_task_sets_the_distance_that_counts_as_moved() -> None:
         run.close()
         return run.network_weights()["policy"]["0.weight"]
 
-    # 100 is beyond every movement; without a distance, the reward decides.
+    # 100 is more than any movement; without a distance, the reward decides.
     without = weights(None, "all")
     np.testing.assert_array_equal(weights(100.0, "moved"), without)
     assert (weights(None, "moved") != without).any()
@@ -227,7 +227,7 @@ def test_a_task_sets_the_distance_that_counts_as_moved() -> None:
 def test_a_cut_run_ends_with_the_numbers_of_an_unbroken_one(
     tmp_path: Path, variant: Variant
 ) -> None:
-    """Also if q follows the entropy, and the weight of MUSIC's reward the success rate."""
+    """Also if q depends on the entropy, and the weight of MUSIC's reward on the success rate."""
     run = settings(variant, env_steps=800)
     q = {"follows": "shannon_entropy", "points": [[0.0, 1.0], [1.5, 2.0]], "smoothing": 100.0}
     follows = {"tac": {**run.tac.model_dump(), "entropic_index": q}}

@@ -1,4 +1,4 @@
-"""MLflow's pages of a published sweep, as a reader compares q there."""
+"""MLflow's pages of a published sweep, used to compare q."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ NAME = "proof-fetch-push-her"
 
 
 def log_published_sweep(folder: Path) -> str:
-    """Logs a published sweep and its report into a storage's MLflow; where that compares it."""
+    """Log a published sweep and its report into a storage's MLflow; the path of its comparison."""
     sweep = read_archive(REPOSITORY / "docs" / "results" / "data" / NAME)
     file = folder / "sweep.yaml"
     file.write_text(str(sweep.config))
@@ -59,7 +59,7 @@ def log_published_sweep(folder: Path) -> str:
 
 
 def _reports(sweep: Sweep, run: int) -> list[Report]:
-    """Those in which the run was evaluated."""
+    """Reports of the run's evaluations."""
     evaluated, begun = sweep.column(run, names.EVAL_SUCCESS), sweep.runs[run].started or 0
     return [
         Report(
@@ -68,7 +68,7 @@ def _reports(sweep: Sweep, run: int) -> list[Report]:
             timestamp_ms=int(time_ms),
             metrics={
                 metric: float(values[at == step][0])
-                # MLflow compares by what was logged first.
+                # MLflow compares by the metric that was logged first.
                 for metric in sorted(sweep.history, key=lambda one: one != names.EVAL_SUCCESS)
                 for at, values in [sweep.series(run, metric)]
                 if step in at
@@ -80,7 +80,7 @@ def _reports(sweep: Sweep, run: int) -> list[Report]:
 
 @pytest.mark.thorough
 def test_pictures_of_a_comparison(require_service: Callable[[str], Path], tmp_path: Path) -> None:
-    """As the documentation shows them."""
+    """The pages as the documentation shows them."""
     chromium, comparison = require_service("chromium"), log_published_sweep(tmp_path)
     client = MlflowClient(f"sqlite:///{tmp_path}/mlflow.db")
     found = client.get_experiment_by_name(NAME)

@@ -46,7 +46,7 @@ def values(step: int) -> dict[str, float]:
 
 
 def report(step: int, metrics: dict[str, float] | None = None, time: float = 0.0) -> Report:
-    """`time` in seconds after a moment in 2023."""
+    """`time` in seconds, relative to a moment in 2023."""
     ms = 1_700_000_000_000 + round(time * 1000)
     values_then = values(step) if metrics is None else metrics
     return Report(env_steps=step, seconds=time, timestamp_ms=ms, metrics=values_then)
@@ -126,7 +126,7 @@ def client_of(storage: Path) -> MlflowClient:
 
 
 def runs_of(client: MlflowClient, experiment: str = "smoke") -> dict[str, Run]:
-    """The experiment's runs by name, each only once."""
+    """The experiment's runs by name, which must be unique."""
     found = client.get_experiment_by_name(experiment)
     assert found is not None
     runs = list(client.search_runs([found.experiment_id]))
@@ -142,7 +142,7 @@ def logged_steps(client: MlflowClient, run: Run, metric: str = names.EVAL_SUCCES
 def test_a_run_of_another_environment_replaces_the_earlier_one(
     storage: Path, tracker_on: MakeTracker
 ) -> None:
-    """So does a run whose result was deleted to train it again."""
+    """Also a run whose result was deleted to train it again."""
 
     def info(environment: str) -> RunInfo:
         return run_info("a", tags={names.TAG_ENVIRONMENT: environment})
@@ -225,10 +225,10 @@ def test_a_resumed_sweep_continues_its_runs(storage: Path, tracker_on: MakeTrack
     cut = runs_of(client)["finetune/a"]
     assert cut.info.status == "KILLED"
 
-    resources = {"num_cpus": 2}  # which do not change what the sweep has
+    resources = {"num_cpus": 2}  # they do not change the sweep
     second = tracker_on(config={"name": "smoke", "seeds": [0], "resources": resources})
     second.start(run_info("a"))
-    second.log("a", later(STEPS[:4]))  # its checkpoint's history, and what it does after that
+    second.log("a", later(STEPS[:4]))  # its checkpoint's history, and the reports after it
     second.log("a", later(STEPS[4:]))
     assert second.flush(20.0)
     assert {run.info.status for run in runs_of(client).values()} == {"RUNNING"}
@@ -281,7 +281,7 @@ def test_a_changed_plan_has_its_own_parent_run_and_current_runs(
 def test_another_driver_continues_the_runs_from_the_storage_alone(
     storage: Path, tracker_on: MakeTracker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As in a new pod, with only the bucket and the server of the first."""
+    """As in a new pod, which has only the first one's bucket and server."""
     kept: dict[str, str] = {}  # stands for a bucket
     monkeypatch.setattr(SweepLocation, "write", lambda _, path, text: kept.update({path: text}))
     monkeypatch.setattr(
@@ -372,7 +372,7 @@ def test_a_reused_node_is_logged_once(storage: Path, tracker_on: MakeTracker) ->
 
 @pytest.fixture
 def policy(tmp_path: Path) -> Path:
-    """A policy's file: one layer that passes the first two of three inputs on."""
+    """A policy's file: one layer that outputs the first two of three inputs."""
     network = PolicyNetwork(
         weights=(np.eye(2, 3, dtype=np.float32),),
         biases=(np.zeros(2, np.float32),),
@@ -392,7 +392,7 @@ def policy(tmp_path: Path) -> Path:
 def test_many_reused_runs_are_sent_in_few_requests(
     tracker_on: MakeTracker, policy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Histories before policies."""
+    """Histories are sent before policies."""
     calls: list[str] = []
 
     def watch(name: str) -> None:
@@ -411,14 +411,14 @@ def test_many_reused_runs_are_sent_in_few_requests(
     keys = [f"run{number}" for number in range(6)]
     for key in keys:
         tracker.mirror(run_info(key), stored(STEPS, policy.read_bytes()))
-    while not calls:  # the end of the sweep's own run would come first
+    while not calls:  # the end of the sweep's own run would be sent first
         time.sleep(0.01)
     assert not tracker.close(timeout=60.0)
     assert calls[:18] == ["create_run", "log_batch", "set_terminated"] * 6
     assert calls.count("create_logged_model") == 6
 
 
-# Loads the model where this package can't be imported, and acts.
+# Loads the model where this package can't be imported, and computes an action.
 ELSEWHERE = """
 import sys, warnings
 sys.modules["music_rllib"] = None
@@ -437,7 +437,7 @@ def test_a_final_policy_is_a_model_that_loads_and_acts(
 ) -> None:
     tracker = tracker_on()
     tracker.start(run_info("a"))
-    for _ in range(2):  # as after a crash before the run was known to be whole
+    for _ in range(2):  # as after a crash before the run was marked as complete
         tracker.mirror(run_info("a"), stored([2000], policy.read_bytes()))
         assert tracker.flush(60.0), tracker.pending()
     assert not tracker.close(timeout=60.0)
@@ -552,7 +552,7 @@ def test_tracking_prints_nothing(fresh_store: FreshStore) -> None:
 def test_a_second_store_starts_from_empty_tables_of_the_first(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It has nothing else of the first store."""
+    """It has none of the first store's other data."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     for name in ("first", "second"):
         folder = tmp_path / name
@@ -566,7 +566,7 @@ def test_a_second_store_starts_from_empty_tables_of_the_first(
         assert kept.name == f"mlflow-{mlflow.__version__}.db"
 
 
-# A driver that is killed ------------------------------------------------------------------------
+# A killed driver ----------------------------------------------------------------------------------
 
 DRIVER = """
 import sys, time
@@ -593,7 +593,7 @@ def test_a_killed_driver_leaves_neither_gaps_nor_duplicates(
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as driver:
         assert driver.stdout is not None
         reached = next(int(line) for line in driver.stdout if int(line) >= 300)
-        driver.kill()  # SIGKILL, with a request under way as likely as not
+        driver.kill()  # SIGKILL, probably during a request
 
     tracker = tracker_on()
     tracker.start(run_info("a", config={"seed": 0}, settings={}))
@@ -612,14 +612,14 @@ def test_a_killed_driver_leaves_neither_gaps_nor_duplicates(
     assert all(point.value == point.step for point in points)
 
 
-# A server that is killed ------------------------------------------------------------------------
+# A killed server ----------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module", autouse=True)
 def server(
     tmp_path_factory: pytest.TempPathFactory, fresh_store: FreshStore
 ) -> Iterator[MlflowServer]:
-    """Started before the first test, because the start takes long; the last test waits for it."""
+    """Started before the first test, because its start is slow; the last test waits for it."""
     folder = tmp_path_factory.mktemp("server")
     shutil.copy(fresh_store.database, folder)
     server = MlflowServer(folder)
@@ -644,7 +644,7 @@ def test_a_view_is_saved_if_mlflow_has_a_known_version(tracker_on: MakeTracker) 
 def test_a_server_killed_while_logging_loses_and_duplicates_nothing(
     server: MlflowServer, tracker_on: MakeTracker, policy: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Killed and started again; later it hangs, and the next driver sends the rest."""
+    """The server is killed and restarted; later it hangs, and the next driver sends the rest."""
     server.wait()
     tracker = tracker_on(tracking_uri=server.uri)
     tracker.start(run_info("a"))
@@ -654,7 +654,7 @@ def test_a_server_killed_while_logging_loses_and_duplicates_nothing(
         time.sleep(0.005)
     server.signal(signal.SIGKILL)
     tracker.log("a", [report(step, time=step) for step in steps[100:200]])
-    tracker.start(run_info("b"))  # a run whose first request meets a dead server
+    tracker.start(run_info("b"))  # a run whose first request reaches a dead server
     tracker.log("b", [report(1)])
     assert not tracker.flush(1.0)
     assert tracker.pending().error is not None

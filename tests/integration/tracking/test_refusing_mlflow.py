@@ -1,4 +1,4 @@
-"""An MLflow server that refuses every question: wrong credentials, or a fault of its own."""
+"""An MLflow server that refuses every request: wrong credentials, or an internal error."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def status(request: pytest.FixtureRequest) -> int:
 
 
 def _once_free(port: int, handler: type[BaseHTTPRequestHandler]) -> ThreadingHTTPServer:
-    """A server, as soon as the workers of the one that was killed have let go of the port."""
+    """A server, started as soon as the killed one's workers have released the port."""
     for _ in range(300):
         with contextlib.suppress(OSError):
             return ThreadingHTTPServer(("127.0.0.1", port), handler)
@@ -41,7 +41,7 @@ def _once_free(port: int, handler: type[BaseHTTPRequestHandler]) -> ThreadingHTT
 
 @contextlib.contextmanager
 def refusing(status: int, port: int = 0) -> Iterator[int]:
-    """A server that is in health, and refuses everything else; its port."""
+    """Port of a server that is healthy and refuses every other request."""
 
     class Refusing(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
