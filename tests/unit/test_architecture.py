@@ -1,4 +1,4 @@
-"""docs/architecture.md tells of what is there; files and folders stay small."""
+"""docs/architecture.md matches the code; files and folders stay small."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The files of `cluster/`: sound by their real schemas, which notice planted mistakes."""
+"""The files of `cluster/` are valid by their real schemas, which find planted mistakes."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ LATER = "kuberay/raycluster-1.7/kustomization.yaml"
 
 @pytest.fixture(autouse=True)
 def token(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What `ray get-auth-token --generate` leaves."""
+    """Token file of `ray get-auth-token --generate`."""
     (tmp_path / "home" / ".ray").mkdir(parents=True)
     (tmp_path / "home" / ".ray" / "auth_token").write_text("t")
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
 
 
 def load(name: str) -> Any:
-    """A file in which the user has put in a profile."""
+    """A file in which the user has entered a profile."""
     return yaml.safe_load((CLUSTER / name).read_text().replace("CHANGE-ME", "mine"))
 
 
@@ -56,7 +56,7 @@ def test_file_is_sound(name: str) -> None:
 
 
 def test_instances_must_have_a_profile_of_your_own() -> None:
-    """Workers, too: Ray gives one to the head alone, and they would not reach the bucket."""
+    """Workers need one too: Ray only gives one to the head, and they would not reach the bucket."""
     problems = check_file(CLUSTER / "aws.yaml")
     assert [problem.partition(":")[0] for problem in problems] == [
         f"available_node_types.{kind}.node_config.IamInstanceProfile.Name"
@@ -205,7 +205,7 @@ POLICY = {"policy": "DeleteNone"}
 @pytest.mark.parametrize(
     ("gone", "given"),
     [
-        # In this mode someone else submits the job.
+        # In this mode another program submits the job.
         (("entrypoint", "backoffLimit"), {"submissionMode": "InteractiveMode"}),
         (("rayClusterSpec", "backoffLimit"), {"clusterSelector": {"ray.io/cluster": "x"}}),
         (("submitterConfig",), {"submissionMode": "SidecarMode"}),
@@ -356,7 +356,7 @@ def test_a_secret_of_the_clusters_name_is_a_problem() -> None:
 
 
 def crds(folder: Path, **properties: Any) -> Path:
-    """CRDs of which only the top is there."""
+    """CRDs with only their top level."""
     for kind in ("rayclusters", "rayjobs"):
         schema = {"type": "object", "properties": properties}
         version = {"name": "v1", "schema": {"openAPIV3Schema": schema}}
@@ -434,15 +434,15 @@ def test_the_command_says_what_is_wrong(tmp_path: Path) -> None:
 
 
 def test_every_file_with_a_schema_is_checked() -> None:
-    """A new file must not stay unchecked."""
+    """A new file must not remain unchecked."""
     found = {path.relative_to(CLUSTER).as_posix() for path in CLUSTER.rglob("*.y*ml")}
     assert found == set(ALL)
-    # Each kind is the one of some file, so that none is untried.
+    # Each kind has a file, so that none is untested.
     kinds = {next(key for key in KINDS if key in load(name)) for name in ALL}
     assert kinds == set(KINDS)
 
 
-# -- what must agree with the rest of the project ---------------------------------------------
+# -- agreement with the rest of the project ---------------------------------------------------
 
 
 def exact(package: str) -> str:
@@ -501,7 +501,7 @@ def test_kustomize_puts_the_objects_together() -> None:
 
 
 def test_grafana_finds_its_dashboards_and_prometheus() -> None:
-    """Where the files of `dashboards/` say, by the names that compose gives."""
+    """At the addresses in the files of `dashboards/`, with the names that compose gives."""
     services = load("compose.yaml")["services"]
     mounted = dict(volume.split(":")[:2][::-1] for volume in services["grafana"]["volumes"])
     inside = "/etc/grafana/provisioning"
@@ -563,7 +563,7 @@ def test_compose_takes_every_secret_from_the_environment(tmp_path: Path) -> None
     assert stat.S_IMODE(env.stat().st_mode) == 0o600
     written = dict(line.split("=", 1) for line in env.read_text().splitlines())
     text = (CLUSTER / "compose.yaml").read_text()
-    # With ":?" compose stops where it is missing; ":-" gives a default, which no secret may have.
+    # With ":?" compose stops if it is missing; ":-" gives a default, which a secret must not have.
     required = set(re.findall(r"\$\{(\w+):\?", text))
     assert required == set(written)
     for name in re.findall(r"\$\{(\w+):-", text):
@@ -593,9 +593,7 @@ def test_token_authentication_is_on_everywhere() -> None:
 
 
 def test_your_secret_is_not_the_one_that_kuberay_keeps_its_token_in() -> None:
-    """KubeRay takes an existing Secret of the cluster's name for its own, and starts no pod when
-    `auth_token` isn't in it.
-    """
+    """KubeRay uses an existing Secret with the cluster's name, which must have `auth_token`."""
     guide = (ROOT / "docs" / "operations.md").read_text()
     (made,) = re.findall(r"kubectl create secret generic (\S+)", guide)
     (read,) = re.findall(r"kubectl get secret (\S+)", guide)
@@ -642,7 +640,7 @@ def test_mlflow_does_not_start_without_its_secrets(change: dict[str, str], messa
 
 
 def test_copies_are_independent() -> None:
-    """The check must not change what it is given; `ray up` is given it afterwards."""
+    """The check must not change its argument, which `ray up` receives afterwards."""
     document = load("aws.yaml")
     before = copy.deepcopy(document)
     list(KINDS["provider"](document, CLUSTER / "aws.yaml"))

@@ -1,4 +1,4 @@
-"""Documentation and code say the same: settings, metrics, tasks, links and examples."""
+"""Documentation and code agree on settings, metrics, tasks, links and examples."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_sweeps_in_the_documentation_are_valid(example: str, tmp_path: Path) -> 
 
 
 def anchors(text: str) -> set[str]:
-    """Of a page's headings, as GitHub makes them."""
+    """Anchors of a page's headings, as GitHub creates them."""
     headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 

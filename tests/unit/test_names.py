@@ -1,4 +1,4 @@
-"""Names that MLflow accepts, and a module that costs nothing to import."""
+"""Names that MLflow accepts, and a module that imports nothing heavy."""
 
 from __future__ import annotations
 

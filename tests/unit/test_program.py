@@ -27,7 +27,7 @@ HEAVY = {"ray", "torch", "mlflow", "gymnasium", "optuna", "numpy", "pandas", "mu
 
 
 def commands() -> list[tuple[str, ...]]:
-    """Every command, by the words that call it."""
+    """All commands, as words of the command line."""
 
     def below(group: Any, words: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
         yield words
@@ -44,7 +44,7 @@ def help_of(words: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> str:
 
 
 def examples() -> list[list[str]]:
-    """The commands that help shows, without what stands in front of the program's name."""
+    """Commands in the output of help, without the text before the program's name."""
     found = []
     for words in commands():
         command: Any = get_command(app)
@@ -126,7 +126,7 @@ def test_help_and_version_load_nothing_heavy(tmp_path: Path) -> None:
 
 
 def test_the_program_accepts_the_examples_of_its_help() -> None:
-    """Every option and argument is known; what they name is not looked at."""
+    """Every option and argument is known; files that they name are not checked."""
     found = examples()
     assert len(found) > 30
     for given in found:
@@ -155,7 +155,7 @@ def test_init_writes_a_valid_sweep_and_overwrites_nothing(
     assert main(["plan", "my reach.yaml", "seeds=2"]) == 0
     assert "6 runs, 60,000 env steps in total" in capsys.readouterr().out
     assert load_config("my reach.yaml").name == "my_reach"
-    # The other sweep that its comments show.
+    # The other sweep, in its comments.
     text = Path("my reach.yaml").read_text()
     kept, _, other = text.partition("# With MUSIC")
     shown = [line.removeprefix("#").removeprefix(" ") for line in other.splitlines()[2:]]

@@ -98,7 +98,7 @@ def test_secrets_are_omitted_at_every_depth() -> None:
 
 
 def test_names_and_counts_of_tokens_are_kept() -> None:
-    """Without them a sweep that is continued from its storage would be another one."""
+    """Without them, a sweep that resumes from its storage would be a different one."""
     settings = {
         "tasks": ["TokenRing"],
         "environments": {"TokenRing": {"env_kwargs": {"n_tokens": 4, "token": "hunter2"}}},
@@ -256,7 +256,7 @@ def test_a_console_shows_markup_and_escapes_as_text(capsys: pytest.CaptureFixtur
 def test_an_error_shows_control_characters_as_text(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A file's name and its values are somebody's text."""
+    """A file's name and values come from other people."""
     file = tmp_path / "a\x1b[2Jb.yaml"
     file.write_text('name: "\\e[31m[red]\\u202e"\n"k\\e": 1\n')
     assert sweep_main(["plan", str(file)]) == 2
@@ -275,14 +275,14 @@ def test_an_error_shows_control_characters_as_text(
     ],
 )
 def test_redaction_takes_linear_time(text: str) -> None:
-    """Quadratic, the first would take minutes."""
+    """In quadratic time, the first one would take minutes."""
     began = time.process_time()
     redact(text)
     assert time.process_time() - began < 1
 
 
 def test_a_password_in_the_tracking_uri_is_not_kept(tmp_path: Path) -> None:
-    """It should be in the environment; where it is not, the copy of the file leaves it out."""
+    """It should be in the environment; if it is in the URI, the copy of the file omits it."""
     kept_sweep(tmp_path, mlflow={"tracking_uri": "http://music:planted-in-a-uri@localhost:1"})
     kept = [path for path in (tmp_path / "s").rglob("*") if path.is_file()]
     assert not [path for path in kept if b"planted" in path.read_bytes()]

@@ -1,7 +1,7 @@
-"""Each number of the results page follows from the exported runs by plain pandas and scipy.
+"""Each number of the results page follows from the exported runs with plain pandas and scipy.
 
-Nothing here is computed by the package: the definitions are those of docs/comparing_q.md and
-docs/reports.md, written down a second time.
+Nothing here uses the package: the definitions of docs/comparing_q.md and docs/reports.md are
+implemented a second time.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def areas(study: str, stage: str, q: str, metric: str) -> pd.Series:
 
 
 def areas_of_all_steps(study: str, stage: str, metric: str, total: int) -> pd.Series:
-    """The area of each seed at q = 1 over `total` steps, those of the pretraining first."""
+    """The area of each seed at q = 1 over `total` steps, starting with those of the pretraining."""
     own = runs(study, stage).query("q == '1'")
     values = []
     for run, source in zip(own.run, own.source, strict=True):
@@ -107,7 +107,7 @@ def compared(x: pd.Series, y: pd.Series) -> Claim:
 
 
 def decided(family: list[Claim], dropped: int = 0) -> list[Claim]:
-    """Holm's method with Shaffer's multiplier: the comparisons of which a test is left."""
+    """Holm's method with Shaffer's multiplier; returns the comparisons with a remaining test."""
     tests = sorted((claim[kind], i, kind) for i, claim in enumerate(family) for kind in KINDS)
     left, highest = [set(KINDS) for _ in family], 0.0
     for p, i, kind in tests:
@@ -190,7 +190,7 @@ def test_every_row_of_the_summary() -> None:
 
 
 def test_the_verdicts_at_several_alphas() -> None:
-    """Of the section on q and entropy, in the order of its list."""
+    """Numbers of the section on q and entropy, in the order of its list."""
     pairs = (("1.5", "1"), ("2", "1"), ("2", "1.5"))
     sides = {q: areas("q-entropy-factorial", "her", q, MEAN) for q in ("1", "1.5", "2")}
     claims = decided([compared(sides[a], sides[b]) for a, b in pairs])
@@ -212,7 +212,7 @@ def rate_interval(values: Array, episodes: float) -> tuple[float, float, float]:
 
 
 def median_wait(steps: Array, reached: NDArray[np.bool_]) -> str:
-    """Kaplan and Meier's median and the interval from the order of the runs."""
+    """Kaplan and Meier's median, and the interval from the order of the runs."""
     data = stats.CensoredData(uncensored=steps[reached], right=steps[~reached])
     survival = stats.ecdf(data).sf
     below = np.flatnonzero(survival.probabilities <= 0.5 + 1e-12)

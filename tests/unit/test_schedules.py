@@ -94,7 +94,7 @@ def test_smoothing_uses_the_mean_of_each_round(rounds: list[list[float]], cut: i
     seen, expected = 0, None
     for number, measured in enumerate(rounds):
         for value in measured:
-            if seen == cut:  # a run that is resumed in the middle of a round
+            if seen == cut:  # a run that resumes in the middle of a round
                 state, one = one.state(), Follower(made)
                 one.load_state(state)
             one.observe("shannon_entropy", value, 200 * number)

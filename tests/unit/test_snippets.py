@@ -1,7 +1,7 @@
-"""Every command and snippet of README and docs, as far as that shows without running it.
+"""Checks of all commands and snippets of README and docs that are possible without running them.
 
-Commands of the package are parsed by the commands themselves, in a folder that is not the
-repository's; tests/integration/project/test_first_hour.py runs what a newcomer runs.
+The package's own commands parse their examples, in a folder outside the repository;
+tests/integration/project/test_first_hour.py runs a newcomer's commands.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 MODULES = {
     "music_rllib.sweep": "music_rllib.program",
 }
-"""What `python -m` starts, and where its application is."""
+"""Modules for `python -m`, and their applications."""
 OTHERS = {
     ".",
     "aws",
@@ -49,7 +49,7 @@ OTHERS = {
     "optuna-dashboard",
     "sh",
 }
-"""Programs that are not this project's, nor installed with it, or that are looked into below."""
+"""Programs of other projects that are not installed with this one, or that are checked below."""
 
 
 def blocks(page: Path, language: str) -> list[str]:
@@ -69,7 +69,7 @@ def snippets(language: str) -> list[Any]:
 
 
 def commands(text: str) -> Iterator[list[str]]:
-    """The words of each simple command, without what is set before it and where it writes."""
+    """The words of each simple command, without variables before it and redirections."""
     text = re.sub(r"(^|\s)#(\s|!|SBATCH).*$", "", text.replace("\\\n", " "), flags=re.MULTILINE)
     lexer = shlex.shlex(text, posix=True, punctuation_chars=";|&\n")
     lexer.whitespace_split, lexer.whitespace, lexer.commenters = True, " \t", ""
@@ -94,7 +94,7 @@ def test_commands_are_told_apart() -> None:
 
 
 def parse(command: Any, name: str, words: list[str]) -> None:
-    """Parse as the program does, down to the last sub-command; nothing is called."""
+    """Parse as the program does, down to the last sub-command, without calling it."""
     context = command.make_context(name, list(words))
     # A group, of click's (Ray) or of Typer's own copy of it.
     while hasattr(command, "resolve_command") and (
@@ -109,7 +109,7 @@ def application(module: str) -> Any:
 
 
 def check(words: list[str]) -> None:
-    """That a command is one, its options and files are there; those inside of it, too."""
+    """Check that a command, its options and files exist, including commands in its arguments."""
     program = words[0].rpartition("/")[2]
     if program in ("exec", "srun"):
         check(words[1:])
@@ -164,7 +164,7 @@ def test_commands_are_what_the_programs_take(
     ],
 )
 def test_wrong_commands_are_found(command: str) -> None:
-    # Typer has a click of its own, and Ray the real one.
+    # Typer has its own copy of click, and Ray uses the real one.
     with pytest.raises((AssertionError, click.UsageError, *typer.BadParameter.__mro__[1:2])):
         check(shlex.split(command))
 

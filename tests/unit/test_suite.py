@@ -1,4 +1,4 @@
-"""The suite itself: its longest files are begun first."""
+"""The suite itself: its slowest files start first."""
 
 from __future__ import annotations
 
@@ -14,6 +14,6 @@ def test_the_files_that_are_begun_first_exist() -> None:
 
 
 def test_make_keeps_that_order() -> None:
-    """Without the option, pytest-xdist begins with the files of many tests."""
+    """Without the option, pytest-xdist starts with the files that have many tests."""
     makefile = (TESTS.parent / "Makefile").read_text(encoding="utf-8")
     assert "--dist loadscope --no-loadscope-reorder" in makefile

@@ -112,7 +112,7 @@ def test_higher_layers_replace_lower_layers(load: Callable[..., SweepConfig]) ->
 
 
 def test_a_group_in_a_grid_is_merged_field_by_field(load: Callable[..., SweepConfig]) -> None:
-    """What it does not name stays, as in every other layer: the preset's networks, for one."""
+    """Settings that it does not name are kept, as in every layer: here the preset's networks."""
     tuned = [{"entropic_index": 1.0, "alpha": 0.05}, {"entropic_index": 1.5, "alpha": 0.15}]
     document = changed(preset="small")
     plain = run_of(load(document), stage=1).tac
@@ -293,7 +293,7 @@ def test_a_storage_can_name_environment_variables(
     monkeypatch.setenv("SCRATCH", "")
     with pytest.raises(ConfigError, match=r"sweep\.yaml:\d+: storage must .* got \$SCRATCH in"):
         load(changed(storage="$SCRATCH/a"))
-    # A sweep's own folder, or what a shell has expanded already.
+    # A sweep's own folder, or a pattern that the shell has already expanded.
     assert load(changed(storage="$SCRATCH/a"), storage="/x$y/a").storage == "/x$y/a"
 
 
@@ -558,7 +558,7 @@ def test_policies_need_the_same_networks_on_both_sides(
         "tac.layer_norm in stage f as in stage u",
         "tac.normalise_observations in stage f as in stage u",
     ]
-    # The same numbers would be other widths.
+    # The same numbers would mean other standard deviations.
     for theirs, ours, wrong in (
         ({}, {"log_std_form": "tanh"}, ["log_std_form"]),
         ({"log_std_form": "tanh"}, {}, ["log_std_form"]),

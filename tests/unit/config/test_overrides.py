@@ -55,7 +55,7 @@ def test_overrides_equal_an_edited_file(tmp_path: Path) -> None:
         .replace("tac: {alpha", "env_steps: 70000\n    tac: {alpha")
     )
     assert runs(config) == runs(load_config(path))
-    # What the sweep's folder keeps makes the same sweep again.
+    # The files kept in the sweep's folder reproduce the sweep.
     kept = tmp_path / "config.json"
     kept.write_text(json.dumps(config.document))
     assert runs(load_config(kept)) == runs(config)

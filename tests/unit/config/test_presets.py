@@ -175,7 +175,7 @@ def test_every_shipped_sweep_is_valid(path: Path) -> None:
 
 
 def test_music_2021_learns_from_the_intrinsic_reward_of_music_r(tmp_path: Path) -> None:
-    """Targets are iterated to where they end if every step pays -1, and if every step pays -2."""
+    """Targets are iterated to their limit if every step pays -1, and if every step pays -2."""
     finetune = load_config(sweep(tmp_path, "music-2021")).stages[1].points[0].runs["FetchPush"].tac
     values = torch.zeros(2, dtype=torch.float64)
     for _ in range(3000):

@@ -17,10 +17,10 @@ SPARSE = Range(-1.0, 0.0)
     [
         ([0, -25, -39, 39], [0, 0, 0, 0], [False] * 4),
         ([0, -41, 41], [0, 0, 0], [False, True, True]),
-        # A policy so narrow that its entropies weigh as much as ten rewards, and later not.
+        # At first the policy is so narrow that its entropies weigh as much as ten rewards.
         ([-41, -300, -300, -500], [0, -10, 0, 0], [True, False, False, True]),
         ([math.nan, -math.inf, -41], [0, 0, math.nan], [False, True, True]),
-        # An entropy that is not known hides nothing that comes later.
+        # An unknown entropy does not hide a later divergence.
         ([0, -41, -41], [math.nan, 0, 0], [False, True, True]),
     ],
 )

@@ -106,7 +106,7 @@ def layout_of(env: Env) -> ReplayLayout:
 
 
 class GoalsWithoutReward(gym.Env[dict[str, Floats], Floats]):
-    """Has goals, and a reward that only a step gives."""
+    """Has goals, and a reward that only a step computes."""
 
     observation_space = gym.spaces.Dict(
         {
@@ -133,7 +133,7 @@ def test_symmetries_that_change_rewards_are_refused() -> None:
 
 @pytest.mark.parametrize("goals", ["environment", "zero"])
 def test_goals_change_also_without_a_compute_reward(goals: str) -> None:
-    """A replay without hindsight needs no rewards of other goals."""
+    """A replay without hindsight does not need rewards of other goals."""
 
     class Runner:
         layout = LAYOUT

@@ -42,8 +42,8 @@ def probed(
     monkeypatch: pytest.MonkeyPatch, kind: type[Sound], *, hindsight: bool = False, **task: Any
 ) -> Probe:
     monkeypatch.setattr(probe, "MOST_STEPS", 3000)
-    monkeypatch.setattr(probe, "MOST_SECONDS", 60.0)  # on a busy machine, too
-    # An id of its own: Gymnasium warns of one that is registered again.
+    monkeypatch.setattr(probe, "MOST_SECONDS", 60.0)  # on a busy machine too
+    # A new id: Gymnasium warns about an id that is registered twice.
     name = f"Probed{kind.__name__}{id(kind)}-v0"
     gym.register(name, entry_point=lambda **_: kind(), max_episode_steps=20)
     try:

@@ -141,7 +141,7 @@ def test_every_node_starts_once_and_after_its_input(plan: Plan, seed: int) -> No
 
 
 def test_an_error_of_the_storage_is_found_behind_one_of_tune() -> None:
-    """Tune raises the text of a traceback in place of an error in a callback."""
+    """Tune raises the text of a traceback instead of an error in a callback."""
 
     def behind(error: Exception) -> BaseException | None:
         try:

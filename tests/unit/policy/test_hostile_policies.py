@@ -1,4 +1,4 @@
-"""Policies from strangers: nothing in them is imported, executed, or read without end."""
+"""Policies from strangers: nothing in them is imported, executed, or read without a limit."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.hostile_files import INPUTS, PENDULUM, STRANGE, seal_policy, write_po
 
 @pytest.fixture
 def evil(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], bool]:
-    """A module in the current folder; says whether it has been imported."""
+    """A module in the current folder; returns whether it has been imported."""
     ran = tmp_path / "ran"
     (tmp_path / "evil_module.py").write_text(f"import pathlib; pathlib.Path({str(ran)!r}).touch()")
     monkeypatch.chdir(tmp_path)
@@ -59,14 +59,14 @@ def test_evaluate_imports_nothing_that_a_file_names(
     assert sweep_main(["evaluate", place, "--episodes", "1"]) == 2
     assert "evil_module:Evil-v0" in capsys.readouterr().err
     assert not evil()
-    # The user says it: then it is imported, and found to register no such environment.
+    # With the user's consent it is imported, and found to register no such environment.
     assert sweep_main(["evaluate", place, "--episodes", "1", "--env", EVIL.env_id]) == 2
     assert "Evil" in capsys.readouterr().err
     assert evil()
 
 
 def test_the_same_policy_of_a_known_environment_is_played(tmp_path: Path) -> None:
-    """Pendulum is Gymnasium's; what a sweep's YAML declares is the user's own."""
+    """Pendulum is Gymnasium's; an environment of a sweep's YAML is the user's own."""
     policy = load_policy(write_policy(tmp_path / "known", PENDULUM))
     open_task(policy).close()
     longer = PENDULUM.model_copy(update={"env_kwargs": {"g": 9.0}})
@@ -109,19 +109,19 @@ def test_which_environments_a_file_may_name(
     assert known_environment(task, [task]) == (env_id, kwargs)
 
 
-# Files that are none ------------------------------------------------------------------------------
+# Not regular files --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", STRANGE)
 @pytest.mark.parametrize("file", ["handoff.json", "policy.safetensors"])
 def test_only_regular_files_are_read(tmp_path: Path, kind: str, file: str) -> None:
-    """A link to an endless device has filled a disk, a FIFO waited for ever."""
+    """A link to an endless device would fill a disk, a FIFO would block."""
     node = seal_policy(tmp_path, PENDULUM)
     (node / "handoff" / file).unlink()
     STRANGE[kind](node / "handoff" / file)
     with pytest.raises(PolicyError, match=r"must (have|be readable)"):
         load_policy(node)
-    # A handoff that came alone is not copied first.
+    # A handoff without its run is not copied first.
     (node / "manifest.json").unlink()
     with pytest.raises(PolicyError, match=r"must (have|hold|be)"):
         load_policy(node)

@@ -1,4 +1,4 @@
-"""Policies of runs: the same actions as the networks that were trained, and nothing executed."""
+"""Policies of runs: the same actions as the trained networks, and nothing is executed."""
 
 import dataclasses
 import json
@@ -150,7 +150,7 @@ def test_scales_to_the_environments_bounds() -> None:
         high=np.array([2.0, 10.0], np.float32),
         goal_size=0,
     )
-    # tanh(0) is the middle, tanh(+-100) the ends.
+    # tanh(0) is the middle, tanh(+-100) the bounds.
     np.testing.assert_allclose(network.act([0.0, 0.0]), [0.0, 5.0])
     np.testing.assert_allclose(network.act({"observation": [100.0, -100.0]}), [2.0, 0.0])
     # Between such bounds every action would be the highest one.
@@ -271,7 +271,7 @@ def test_a_run_that_sweeps_share_is_found_by_the_label_of_each(tmp_path: Path) -
 
 
 def test_a_folder_of_several_tasks_names_its_sub_folders(tmp_path: Path) -> None:
-    """As `best` leaves the policies of a sweep with several tasks."""
+    """Like the output of `best` for a sweep with several tasks."""
     for task in ("FetchReach", "Other"):
         (tmp_path / task).mkdir()
         Trained(_run()).write(tmp_path / task)

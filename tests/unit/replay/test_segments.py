@@ -1,4 +1,4 @@
-"""The replay's files: what a checkpoint writes, and that nothing is lost."""
+"""The replay's files: the bytes that a checkpoint writes, without any loss."""
 
 from __future__ import annotations
 

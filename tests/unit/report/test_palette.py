@@ -57,7 +57,7 @@ def test_color_blind_readers_can_distinguish_the_paper_s_values_of_q(vision: str
 @pytest.mark.parametrize("q", [*COMPARED, "1.25", "1.75", "learned"])
 @pytest.mark.parametrize("paper", [LIGHT, DARK])
 def test_every_color_has_enough_contrast(q: str, paper: str) -> None:
-    """WCAG 2.1 asks for 3:1 of graphics."""
+    """WCAG 2.1 requires 3:1 for graphics."""
     assert contrast(color_of(q), paper) >= 3
 
 

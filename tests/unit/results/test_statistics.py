@@ -154,7 +154,7 @@ def test_kaplan_meier_median_by_hand() -> None:
 def test_censored_runs_increase_the_median() -> None:
     assert median([10, 20, 30], [True] * 3)[0] == 20
     assert median([10, 20, 30, 100, 100], [True] * 3 + [False] * 2) == (30, 10, np.inf)
-    # The run that was stopped at 5 may arrive last, so 10 is not the lower end.
+    # The run that was stopped at 5 may arrive last, so 10 is not the lower limit.
     assert median([5, 10, 20, 30, 40], [False] + [True] * 4)[1:] == (5, np.inf)
 
 

@@ -46,7 +46,7 @@ def test_only_the_warning_about_rllibs_own_environment_is_hidden() -> None:
         warnings.simplefilter("always")
         quiet.quiet_third_parties()
         for name in ("rllib-single-agent-env-v0", "FetchPush-v4"):
-            # The colour codes are gymnasium's.
+            # The color codes are gymnasium's.
             warnings.warn(
                 f"\x1b[33mWARN: Overriding environment {name} already in registry.\x1b[0m",
                 stacklevel=1,

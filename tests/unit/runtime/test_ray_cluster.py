@@ -68,7 +68,7 @@ with own_folder("music-tune-", Path(sys.argv[1])) as folder:
 
 
 def test_folders_of_killed_processes_are_removed_at_the_next_start(tmp_path: Path) -> None:
-    """And no others: of living processes, of other users, or without a lock."""
+    """It removes no other folders: of living processes, of other users, or without a lock."""
     subprocess.run([sys.executable, "-c", KILLED, tmp_path], check=False)
     (killed,) = tmp_path.iterdir()
     assert killed.name.startswith("music-tune-")
@@ -105,7 +105,7 @@ NEVER = 4_194_304
 def test_a_folder_that_a_dying_ray_makes_again_is_removed_hours_later(
     file: str, process: int, hours: int, removed: bool, tmp_path: Path
 ) -> None:
-    """It has no lock. Its process has ended, and nothing else is in it."""
+    """It has no lock, its process has ended, and nothing else is in it."""
     session = tmp_path / "mr-0_a1b2c3" / "r" / f"session_2026-11-26_23-29-15_979549_{process}"
     (session / "logs").mkdir(parents=True)
     (session / file).touch()

@@ -417,12 +417,12 @@ CHOICES: Document = {
     "tac.bootstrap": {"choice": ["value", "critics"]},
     "tac.policy_critic": {"choice": ["first", "min"], "when": {"tac.bootstrap": "critics"}},
 }
-"""9 points."""
+"""A grid of 9 points."""
 ONE_OR_MANY: Document = {
     "tac.bootstrap": {"choice": ["value", "critics"]},
     "tac.alpha": {"float": [0.01, 1.0], "log": True, "when": {"tac.bootstrap": "critics"}},
 }
-"""One point, and a range of others."""
+"""One point, and a range for other settings."""
 FEW_OR_MANY: Document = {
     "tac.batch_size": {"choice": [*range(1, 21)]},
     "tac.alpha": {"float": [0.01, 1.0], "log": True, "when": {"tac.batch_size": 20}},

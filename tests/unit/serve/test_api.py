@@ -181,7 +181,7 @@ def test_many_problems_are_cut_short(post: Post) -> None:
 
 
 def test_a_body_longer_than_any_valid_one(url: str) -> None:
-    def endless() -> Iterator[bytes]:  # chunked, so that no header gives the length away
+    def endless() -> Iterator[bytes]:  # chunked, so that no header contains the length
         for _ in range(100):
             yield b"[" * 10_000
 
@@ -192,7 +192,7 @@ def test_a_body_longer_than_any_valid_one(url: str) -> None:
 
 
 def test_no_action_is_better_than_nan(post: Post) -> None:
-    """Each number is a float32, but their sum is none."""
+    """Each number is a float32, but their sum is not."""
     status, body = post(GOOD | {"observation": [3.4e38] * 4})
     assert status == 422
     assert "no finite action" in body["error"]

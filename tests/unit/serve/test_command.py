@@ -11,7 +11,7 @@ from tests.ports import free_port
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """What is said to arguments that are answered with code 2."""
+    """Message for arguments that end with code 2."""
     code = main(["serve", *arguments])
     output, errors = capsys.readouterr()
     assert (code, output) == (2, "")

@@ -198,7 +198,7 @@ def test_a_look_at_a_lease_from_a_fast_clock_takes_a_minute_at_most(
 
 
 def test_an_owner_that_lost_its_lease_leaves_no_folder(tmp_path: Path) -> None:
-    """Another sweep took the run over, finished it and deleted its folder."""
+    """Another sweep took over the run, finished it and deleted its folder."""
     path = tmp_path / "work" / "key" / "lease.json"
     file, mine = lease_file(path), Lease.of_this_process("m", 0.4)
     assert file.acquire(mine) is None

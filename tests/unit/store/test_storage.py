@@ -1,4 +1,4 @@
-"""Addresses of storages, and the checks before anything starts, which leave no files."""
+"""Addresses of storages, and the checks before a sweep starts, which leave no files."""
 
 from __future__ import annotations
 
@@ -157,7 +157,7 @@ class Away(pafs.FSSpecHandler):  # type: ignore[misc]
 
 @pytest.fixture
 def away(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[StorageFolder, list[str]]]:
-    """The bucket, for which this process waits for a minute, and what it says."""
+    """The bucket, for which this process waits for a minute, and its messages."""
     memory = MemoryFileSystem()
     memory.store.clear()
     memory.pseudo_dirs[:] = [""]

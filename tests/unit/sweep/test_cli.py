@@ -1,4 +1,4 @@
-"""Bad input at the command line: exit code 2, a clear message, and nothing begun."""
+"""Bad input at the command line: exit code 2, a clear message, and nothing is started."""
 
 import json
 from collections.abc import Callable
@@ -25,7 +25,7 @@ Document = dict[str, Any]
 
 @dataclass
 class Result:
-    """What the program did."""
+    """Exit code and output of the program."""
 
     exit_code: int
     output: str
@@ -41,7 +41,7 @@ PRETRAIN: Document = {"name": "pretrain", "variant": "music-u"}
 def program(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> Program:
-    """`music-rllib` in a folder of its own, up to where a sweep would begin."""
+    """`music-rllib` in its own folder, up to the point where a sweep would start."""
     monkeypatch.chdir(tmp_path)
 
     def begun(*_: object, **__: object) -> int:
@@ -326,7 +326,7 @@ def test_a_mistyped_option_is_bad_input(program: Program) -> None:
     result = program(document(), "--dryrun")
     assert result.exit_code == 2
     assert "No such option: --dryrun" in result.stderr
-    # With the usage of the command that it was given to.
+    # With the usage of the command that received it.
     result = program(None, "status", "results/s", "--nope")
     assert result.exit_code == 2
     assert result.stderr.startswith("Usage: music-rllib status ")
@@ -356,7 +356,7 @@ LONG = "x" * 300
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        # An empty option is not left out.
+        # An empty option is not ignored.
         (("run", "sweep.yaml", "--name", ""), "--name: name must "),
         (("plan", "sweep.yaml", "--storage", ""), "--storage: storage must not be empty"),
         (("plan", "sweep.yaml", "--seeds", ""), "--seeds must be a number of seeds"),

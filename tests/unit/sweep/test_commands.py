@@ -1,4 +1,4 @@
-"""Sub-commands on a sweep's storage: a folder, and a bucket that another machine reaches."""
+"""Sub-commands on a sweep's storage: a folder or a bucket."""
 
 from __future__ import annotations
 
@@ -75,14 +75,14 @@ SWEEP: dict[str, Any] = {
 
 
 class Said:
-    """What the program answered."""
+    """Exit code and output of the program."""
 
     def __init__(self, code: int, output: str, errors: str) -> None:
         self.code, self.output, self.errors = code, output, errors
 
     @property
     def document(self) -> Any:
-        """Its one JSON document."""
+        """The only JSON document of its output."""
         assert self.code == 0, self.errors
         return json.loads(self.output)
 
@@ -98,18 +98,18 @@ IN_A_BUCKET = pytest.mark.parametrize("storage", ["folder", "bucket"], indirect=
 
 @pytest.fixture
 def storage(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Storage of the sweep; the bucket is a file system without renames or folders of its own."""
+    """Storage of the sweep; the bucket is a file system without renames and folders."""
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     monkeypatch.chdir(tmp_path)
     if getattr(request, "param", "folder") == "folder":
         return str(tmp_path / "results")
-    # Nobody else writes leases here.
+    # No other process writes leases here.
     monkeypatch.setattr(lease_module, "SETTLE_SECONDS", 0.0)
     memory = MemoryFileSystem()
     memory.store.clear()
     memory.pseudo_dirs[:] = [""]
     bucket = StorageFolder(pafs.PyFileSystem(pafs.FSSpecHandler(memory)), "bucket/path")
-    # All are loaded by now: one that was loaded later would keep this for good.
+    # Import all of them first: a module imported later would keep the replacement.
     local = storage_module.open_storage
     for module in (storage_module, node_store, sweep_files, open_sweep_module, clean):
         monkeypatch.setattr(
@@ -429,7 +429,7 @@ def test_clean_deletes_runs_of_earlier_versions_of_the_plan(
 def test_clean_is_refused_while_a_sweep_is_being_started(
     storage: str, tmp_path: Path, program: Program
 ) -> None:
-    """Its state is still that of its last driver."""
+    """Its state is still the one that its last driver wrote."""
     sweep = played(storage, tmp_path)
     with driver_lock.driving(sweep.location):
         said = program("clean", f"{storage}/mine", "--all", "--yes")
@@ -443,7 +443,7 @@ def test_clean_is_refused_while_a_sweep_is_being_started(
 def test_clean_deletes_nothing_if_another_process_computes_a_run(
     storage: str, tmp_path: Path, program: Program
 ) -> None:
-    """A worker that outlives its driver, or one of another sweep."""
+    """Such as a worker that outlives its driver, or one of another sweep."""
     sweep = played(storage, tmp_path, runs=7)
     first, second = (sweep.store.work_folder(node.key) for node in sweep.plan.nodes[7:9])
     for work in (first, second):
@@ -530,7 +530,7 @@ def test_a_plan_of_ten_thousand_runs_asks_a_bucket_for_less_than_a_minute(
         return call
 
     def start(seeds: int) -> float:
-        """The time for requests of a sweep of which half of the runs are finished."""
+        """The time for requests of a sweep with half of its runs finished."""
         nonlocal seconds
         MemoryFileSystem.store.clear()
         sweep = played(storage, tmp_path, runs=3 * seeds // 2, seeds=seeds)
@@ -558,7 +558,7 @@ def test_a_plan_of_ten_thousand_runs_asks_a_bucket_for_less_than_a_minute(
 def test_clean_keeps_a_last_checkpoint_that_another_sweep_shares(
     storage: str, tmp_path: Path, program: Program
 ) -> None:
-    """Runs that differ in their budget alone have one folder for it."""
+    """Runs that differ only in their budget share one folder for it."""
     longer = opened(storage, tmp_path, name="long", defaults={"env_steps": 8000})
     sweep = played(storage, tmp_path)
     node = sweep.plan.nodes[0]
@@ -576,7 +576,7 @@ def test_clean_keeps_a_last_checkpoint_that_another_sweep_shares(
 
 
 def from_handoff(storage: str, tmp_path: Path, name: str = "mine") -> OpenSweep:
-    """A sweep of one run from a handoff in `tmp_path`, which has been taken into the storage."""
+    """A sweep of one run from a handoff in `tmp_path`, which has been copied into the storage."""
     folder = tmp_path / "given"
     pretrained = resolved(SWEEP | {"stages": [{"name": "p", "variant": "music-u"}]}, tmp_path)
     arrays = {"mi_estimator": {"w": np.zeros((3, 2), np.float32)}}
@@ -597,7 +597,7 @@ def resolved(document: dict[str, Any], tmp_path: Path) -> RunSettings:
 def test_a_sweep_goes_on_from_the_handoff_in_its_storage(
     storage: str, tmp_path: Path, program: Program
 ) -> None:
-    """The folder that it was given is on another machine, or was trained anew."""
+    """The folder of the option is on another machine, or was trained again."""
     sweep = from_handoff(storage, tmp_path)
     (node,) = sweep.plan.nodes
     (tmp_path / "given").rename(tmp_path / "moved")
@@ -634,7 +634,7 @@ SEARCH: dict[str, Any] = {
 def test_clean_keeps_what_another_sweep_of_the_same_study_counts_on(
     storage: str, tmp_path: Path, program: Program
 ) -> None:
-    """Each has only the trials that it judged itself in its plan."""
+    """The plan of each sweep has only the trials that it judged itself."""
     stages = [
         {"name": "pretrain", "variant": "music-u"},
         {"name": "tune", "variant": "music-r", "init_from": "pretrain", "search": SEARCH},
@@ -700,7 +700,7 @@ def test_a_damaged_record_is_said(
     for command in commands:
         said = program(command, f"{storage}/other")
         assert (said.code, message in said.errors) == (2, True)
-    # What another sweep shares with it can't be told any more.
+    # The runs that another sweep shares with it are unknown.
     said = program("clean", f"{storage}/mine", "--all", "--yes")
     assert (said.code, message in said.errors) == (2, True)
     assert program("status", f"{storage}/mine").code == 0
@@ -761,7 +761,7 @@ def test_nothing_runs_after_a_crash(storage: str, tmp_path: Path, program: Progr
 def test_a_run_that_queues_for_a_core_does_not_run_yet(
     storage: str, tmp_path: Path, program: Program
 ) -> None:
-    """Tune is handed more runs than there are cores, so that none stays idle."""
+    """Tune gets more runs than there are cores, so that none is idle."""
     sweep = opened(storage, tmp_path)
     at_work, queued = sweep.plan.nodes[:2]
     with StateFile(sweep) as state_file:
@@ -820,7 +820,7 @@ def test_an_analysis_plan_is_recorded_and_changes_no_run(
     plain.write_text(yaml.safe_dump(SWEEP))
     folder = tmp_path / "results/mine"
     keys = {node["key"] for node in program("plan", str(plain), "--json").document["nodes"]}
-    assert not folder.exists()  # plan leaves nothing without an analysis plan
+    assert not folder.exists()  # `plan` writes nothing without an analysis plan
 
     def recorded(**analysis: Any) -> list[Any]:
         asked = {"hypotheses": ["q = 1.5 better than q = 1"], **analysis}
@@ -904,7 +904,7 @@ def test_a_damaged_run_is_named_by_every_command_and_trained_again_when_asked(
 
 
 def test_what_a_search_has_asked_for_before_is_verified_too(tmp_path: Path) -> None:
-    """Its trials aren't part of the plan before the search begins."""
+    """Its trials are not part of the plan before the search starts."""
     search = {"space": {"tac.lr": {"float": [1e-4, 1e-2]}}, "trials": 4}
     stages = [{"name": "train", "variant": "tac", "search": search}]
     storage = str(tmp_path / "results")
@@ -912,7 +912,7 @@ def test_what_a_search_has_asked_for_before_is_verified_too(tmp_path: Path) -> N
     sweep.plan.add_trial("train", 0, {"tac.lr": 1e-3}, [0], "trial0")
     keep_record(sweep)
     (node,) = sweep.plan.nodes
-    with contextlib.suppress(KeyError):  # the scheduler doesn't know it, which is enough here
+    with contextlib.suppress(KeyError):  # the scheduler does not know it, which is enough here
         finish(sweep, StateFile(sweep), node, 0.5, tmp_path / "made")
     (tmp_path / "results/nodes" / node.key / "handoff/handoff.json").write_text("{ }")
     with pytest.raises(DamagedError, match=rf"{node.label}: .*handoff\.json must have 2 bytes"):
@@ -920,7 +920,7 @@ def test_what_a_search_has_asked_for_before_is_verified_too(tmp_path: Path) -> N
 
 
 def test_a_search_asks_for_no_more_once_its_finalists_run(tmp_path: Path) -> None:
-    """What its trials have not used of their budget, since some were stopped early, is not run."""
+    """The unused budget of trials that were stopped early is not counted as remaining."""
     search = {
         "space": {"tac.lr": {"float": [1e-4, 1e-2]}},
         "trials": 4,

@@ -1,4 +1,4 @@
-"""What a plan takes: kinds of runs, and the arithmetic from their speeds."""
+"""Cost of a plan: kinds of runs, and the arithmetic with their speeds."""
 
 from pathlib import Path
 from typing import Any
@@ -91,7 +91,7 @@ def costs(folder: Path, slots: int) -> dict[str, Any]:
 
 
 def test_the_time_is_training_evaluations_and_start(tmp_path: Path) -> None:
-    # 10,000 steps, an evaluation every 5,000 and one before them.
+    # 10,000 steps, an evaluation every 5,000 and one at the start.
     a_run = 100.0 + 3 * 3.0 + 5.0
     document = costs(tmp_path, slots=4)
     assert document["seconds"] == pytest.approx(16 * a_run / 4)

@@ -1,4 +1,4 @@
-"""Memory that runs need, by their settings."""
+"""Memory of runs, by their settings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a sweep exports for Prometheus, with Ray's gauges replaced by what remembers them."""
+"""Metrics that a sweep exports for Prometheus; a recorder replaces Ray's gauges."""
 
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ KEPT = 3
 
 @pytest.fixture
 def exported(monkeypatch: pytest.MonkeyPatch) -> dict[str, dict[str, float]]:
-    """By gauge and run, what was set in the last round."""
+    """By gauge and run: the value of the last round."""
     found: dict[str, dict[str, float]] = {}
 
     class Gauge:
@@ -71,7 +71,7 @@ def test_what_is_exported_does_not_grow_with_the_runs_that_ended(
         gauges.reported(node, [report(100, 0.25), report(300, 0.5)])
     gauges.paused(paused)
     gauges.tick()
-    gauges.reported(paused, [report(300, 0.5), report(400, 0.75)])  # it goes on
+    gauges.reported(paused, [report(300, 0.5), report(400, 0.75)])  # it continues
     for node in others:
         gauges.finished(node, RunResult(label="", env_steps=300, seconds=3, metrics={}))
     exported.clear()

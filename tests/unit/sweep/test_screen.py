@@ -1,4 +1,4 @@
-"""What a person sees: the plan, progress on a terminal and without one, the results."""
+"""Output for the user: the plan, progress with and without a terminal, the results."""
 
 import io
 import math
@@ -115,7 +115,7 @@ def test_the_plan_shows_what_a_control_makes_of_alpha_at_each_q(tmp_path: Path) 
         {"name": "plain", "variant": "tac", "grid": {"tac.alpha": [0.05, 0.1]}},
     ]
     rows = alpha_rows(make_plan(loaded(tmp_path, stages=stages)))
-    # G = q^(-1/2) (sqrt(2 pi) sigma)^(1-q) at q = 2, and of four dimensions its fourth power.
+    # G = q^(-1/2) (sqrt(2 pi) sigma)^(1-q) at q = 2; of four dimensions, its fourth power.
     pressure = 2**-0.5 / ((2 * math.pi) ** 0.5 * 0.1)
     assert [(row["stage"], row["q"]) for row in rows] == [
         ("fixed", "1"),
@@ -164,7 +164,7 @@ def test_results_have_a_row_per_run_whatever_became_of_it(plan: Plan) -> None:
 
 
 class Clock:
-    """A clock that a test sets."""
+    """A clock that the test sets."""
 
     def __init__(self) -> None:
         self.now = 100.0
@@ -176,7 +176,7 @@ class Clock:
 def play(
     display: Display, plan: Plan, scheduler: Scheduler, time: Clock
 ) -> Callable[[float], None]:
-    """One run that ends, one that fails."""
+    """One run that finishes, and one that fails."""
     good, bad = plan.nodes[:2]
 
     def wait(seconds: float) -> None:
@@ -255,7 +255,7 @@ def test_a_terminal_shows_a_live_table(plan: Plan) -> None:
     assert "100" in live
     assert "20 %" in live
     assert "0 of 6 runs finished, 1,000 of 24,000 env steps, 0:12 passed" in live
-    # What is left is 1,000 steps of this run and two of 5,000, at 100 a second.
+    # Left are 1,000 steps of this run and two runs of 5,000, at 100 per second.
     assert "about 1:50 left" in live
 
 

@@ -66,7 +66,7 @@ def test_twin_critics_are_two_separate_perceptrons(sizes: list[int], layer_norm:
 
 
 def test_layer_norm_limits_a_networks_outputs_for_any_input() -> None:
-    """At most the last layer's weights times sqrt(H), whatever the input (RLPD, section 4.2)."""
+    """At most the last layer's weights times sqrt(H), for any input (RLPD, section 4.2)."""
     torch.manual_seed(0)
     network, inputs = Perceptron(7, [16, 9], 1, layer_norm=True), torch.randn(20, 7)
     last = next(layer for layer in reversed(network) if isinstance(layer, nn.Linear))

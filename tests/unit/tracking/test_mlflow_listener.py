@@ -1,4 +1,4 @@
-"""What MLflow shows of a sweep: the runs' names, and the view that its link opens."""
+"""A sweep in MLflow: the runs' names, and the view behind its link."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which tracking URIs are accepted, and the messages if a server does not answer."""
+"""Accepted tracking URIs, and the messages if a server does not answer."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_a_database_is_the_file_in_the_storage_whatever_its_name(
 
 
 def test_postgresql_is_reached_by_the_driver_that_is_installed() -> None:
-    """SQLAlchemy 2.1 takes a URL without a driver for psycopg 3."""
+    """SQLAlchemy 2.1 uses psycopg 3 for a URL without a driver."""
     for driver in ("", "+psycopg2"):
         url = make_url(resolve_store(f"postgresql{driver}://me:pw@db:1/x?a=%20b", "results").uri)
         assert url.drivername == "postgresql+psycopg2"
@@ -222,7 +222,7 @@ def test_a_healthy_server_passes() -> None:
 
 
 class SlowRun:
-    """A run whose records take three seconds or more altogether."""
+    """A run whose records take at least three seconds altogether."""
 
     node_key, source, refused, is_running = "a", None, None, False
     records = 30
@@ -246,7 +246,7 @@ def test_the_end_waits_for_mlflow_while_there_is_progress(monkeypatch: pytest.Mo
 
 
 class DeliveredRun:
-    """A run that waits for its policy to be sent, while `news` arrives with everything sent."""
+    """A run that waits until its policy is sent, while `news` arrives after everything was sent."""
 
     refused, source, is_running = None, None, False
 
@@ -259,7 +259,7 @@ class DeliveredRun:
 
 
 def test_policies_are_sent_although_metrics_never_pause() -> None:
-    """Otherwise a sweep of many short runs keeps the queues of all of them until its end."""
+    """Otherwise a sweep of many short runs would keep all their queues until its end."""
     thread = sender.Sender("the store")
 
     def news() -> None:

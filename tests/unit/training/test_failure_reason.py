@@ -39,7 +39,7 @@ def test_the_cause_is_the_original_exception(error: BaseException | None, expect
 
 
 class WordlessError(Exception):
-    """It needs two arguments, and its message cannot be read."""
+    """An exception with two arguments, whose message cannot be read."""
 
     def __init__(self, first: int, second: int) -> None:
         super().__init__(first, second)
