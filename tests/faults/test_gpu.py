@@ -67,7 +67,7 @@ def same_random_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("local_ray", "same_random_numbers")
 @pytest.mark.parametrize("settings", list(SETTINGS.values()), ids=list(SETTINGS))
-def test_training_equals_that_of_a_cpu_to_rounding(settings: dict[str, Any]) -> None:
+def test_training_equals_a_cpus_up_to_rounding(settings: dict[str, Any]) -> None:
     register_uneven()
     rounds = 3 if "task" in settings else 2
     on_gpu = build(where=ON_GPU, **settings)

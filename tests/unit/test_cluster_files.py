@@ -418,7 +418,7 @@ def test_a_folder_without_crds_is_refused(
     assert message in errors
 
 
-def test_the_command_says_what_is_wrong(tmp_path: Path) -> None:
+def test_the_command_prints_the_problems(tmp_path: Path) -> None:
     (tmp_path / "a.yaml").write_text("services: {head: {image: 3}}")
     (tmp_path / "b.yaml").write_text("x: [")
     done = subprocess.run(

@@ -110,7 +110,7 @@ def test_every_page_is_on_the_documentation_site() -> None:
         "joint_her",
     ],
 )
-def test_the_plan_of_the_claims_is_that_of_their_sweeps(study: str) -> None:
+def test_the_claims_and_their_sweeps_have_the_same_plan(study: str) -> None:
     plan = analysis_plan(load_config(ROOT / "tune_configs" / f"{study}.yaml"))
     assert plan is not None
     (row,) = [

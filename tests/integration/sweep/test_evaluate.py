@@ -99,7 +99,7 @@ def test_a_good_policy_and_an_idle_one(
         (["GOOD", "--video", "no/where/film.gif"], "--video must be in a folder that exists"),
     ],
 )
-def test_bad_input_is_said(
+def test_bad_input_is_named(
     good: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], complaint: str
 ) -> None:
     assert main(["evaluate", *(str(good) if a == "GOOD" else a for a in arguments)]) == 2
@@ -184,7 +184,7 @@ def test_the_files_are_videos(tmp_path: Path, ending: str) -> None:
         write_video(tmp_path / "film.avi", frames)
 
 
-def test_no_driver_is_said_with_what_to_install(
+def test_a_missing_renderer_is_named_with_the_packages_to_install(
     good: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """With a renderer that this machine does not have."""
@@ -200,7 +200,7 @@ def test_no_driver_is_said_with_what_to_install(
     assert not video.exists()
 
 
-def test_a_fresh_process_says_that_mujoco_does_not_load_with_a_way_of_drawing(good: Path) -> None:
+def test_a_fresh_process_reports_that_mujoco_does_not_load_with_a_renderer(good: Path) -> None:
     """Only loading MuJoCo reads the variable, and PyOpenGL's error does not name it."""
     # MuJoCo sets the other variable in a process that has rendered; it would be used.
     inherited = {key: text for key, text in os.environ.items() if key != "PYOPENGL_PLATFORM"}

@@ -43,7 +43,7 @@ def test_a_storage_without_meaning_is_one_line(capsys: pytest.CaptureFixture[str
         ("http://127.0.0.1:8265", "an http address is for 'ray job submit'"),
     ],
 )
-def test_a_cluster_that_does_not_answer_is_said_at_once(
+def test_a_cluster_that_does_not_answer_is_reported_at_once(
     address: str, message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("RAY_ADDRESS", address)

@@ -594,7 +594,7 @@ def resolved(document: dict[str, Any], tmp_path: Path) -> RunSettings:
     return next(iter(load_config(path).stages[0].points[0].runs.values()))
 
 
-def test_a_sweep_goes_on_from_the_handoff_in_its_storage(
+def test_a_sweep_resumes_from_the_handoff_in_its_storage(
     storage: str, tmp_path: Path, program: Program
 ) -> None:
     """The folder of the option is on another machine, or was trained again."""
@@ -690,7 +690,7 @@ DAMAGED = {
 
 @IN_A_BUCKET
 @pytest.mark.parametrize("file", DAMAGED)
-def test_a_damaged_record_is_said(
+def test_a_damaged_record_ends_commands_with_its_place(
     storage: str, tmp_path: Path, program: Program, file: str
 ) -> None:
     played(storage, tmp_path)
@@ -788,7 +788,7 @@ def test_the_recorded_configuration_is_the_sweeps(storage: str, tmp_path: Path) 
     assert found.storage == storage
 
 
-def test_a_sweep_is_found_by_its_folder_whatever_leads_there(
+def test_a_sweep_is_found_by_any_path_to_its_folder(
     tmp_path: Path, program: Program, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     storage = str(tmp_path / "results")

@@ -138,7 +138,7 @@ def test_alpha_of_a_q_that_follows_a_measurement_ends_at_its_last_point(tmp_path
     assert color_of(row["q"]) == color_of("1"), "it has that of its last value"
 
 
-def test_results_have_a_row_per_run_whatever_became_of_it(plan: Plan) -> None:
+def test_results_have_a_row_per_run_in_any_state(plan: Plan) -> None:
     scheduler = Scheduler(plan, finished=[plan.nodes[1].key])
     scheduler.start(plan.nodes[0].key)
     scheduler.fail(plan.nodes[0].key)
@@ -332,7 +332,7 @@ def test_what_a_failed_run_has_spent_stays_spent(plan: Plan) -> None:
         assert display._summary().startswith("0 of 6 runs finished, 1,000 of 24,000 env steps")
 
 
-def test_random_steps_say_nothing_about_the_pace_of_learning(
+def test_random_steps_do_not_count_for_the_speed_of_learning(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("music_rllib.sweep.listeners.screen.PROGRESS_SECONDS", 0.0)

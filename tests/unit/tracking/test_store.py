@@ -63,7 +63,7 @@ def test_a_relative_storage_is_made_absolute(
 
 
 @pytest.mark.parametrize("name", ["q?1", "50%", "100%20off", "#1", "u:p@h", "a b", "ü", "$HOME"])
-def test_a_database_is_the_file_in_the_storage_whatever_its_name(
+def test_a_database_is_the_file_in_the_storage_with_any_name(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for store in (resolve_store(None, f"{tmp_path}/{name}"), resolve_store(None, name)):
@@ -211,7 +211,7 @@ def test_an_unknown_host_is_called_unknown() -> None:
         (403, b"Invalid Host header - possible DNS rebinding attack detected", "--allowed-hosts"),
     ],
 )
-def test_a_server_that_refuses_says_why(status: int, body: bytes, reason: str) -> None:
+def test_the_message_of_a_refusing_server_is_shown(status: int, body: bytes, reason: str) -> None:
     with server_that_answers(status, body) as uri, pytest.raises(TrackingError, match=reason):
         check_reachable(resolve_store(uri, "results"))
 
