@@ -1,7 +1,7 @@
 """Tsallis actor-critic (TAC) with MUSIC on RLlib, and a sweeper that compares entropic indices.
 
 The names below are loaded on first use (PEP 562): ``import music_rllib`` itself loads neither
-torch nor ray, so the command line answers at once and the pure-maths modules stay usable alone.
+torch nor ray, so the command line answers at once and pure mathematics is usable alone.
 """
 
 from __future__ import annotations

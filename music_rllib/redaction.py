@@ -49,7 +49,7 @@ _SECRETS = tuple(
         # An option of a command: --password x.
         rf"""(?P<name>(?<![\w\-])--?(?:[\w\-]{{0,40}}?(?:{_NAMES})[\w\-]{{0,40}}
         |(?:[\w\-]{{0,40}}-)?(?:pass|pw|auth))(?P<equals>(?:["'],)?[ \t]+))(?!-){_VALUE}""",
-        # Of MySQL and sshpass: -px. A space after -p of MySQL means that it asks for a password.
+        # A password after -p of sshpass, or attached to -p of MySQL, whose -p alone asks for it.
         rf"""(?-i:(?P<name>(?:\b(?:mysql|mariadb)[\w\-]{{0,20}}\b[^\n|;&]{{0,400}}?[\s"']-p(?!["']?[,\s\]])
         |\bsshpass["',\s]+(?:-v["',\s]+)?-p)(?P<equals>(?:["'],)?[ \t]{{0,9}}))){_VALUE}""",
         # A webhook of Slack or Discord, to which anyone who knows its address can post.

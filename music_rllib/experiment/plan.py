@@ -88,7 +88,7 @@ class Plan:
         self.seeds = tuple(seeds)
         self.algorithm = algorithm or ALGORITHM_VERSION
         self._runs: dict[tuple[str, str], Node] = {}
-        """By label and key."""
+        """Node by label and key."""
         self._trials: dict[str, dict[str, Any]] = {}
         self._nodes: dict[str, Node] = {}
         self._by_cell: dict[tuple[str, int, str, int], Node] = {}

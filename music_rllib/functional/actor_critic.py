@@ -36,7 +36,7 @@ def critic_loss(q_values: Tensor, target: Tensor, weights: Tensor | None = None)
     Args:
         q_values: [C, B] of the batch's actions.
         target: [B]
-        weights: [B] importance weights of prioritised replay.
+        weights: [B] importance weights of prioritized replay.
     """
     squares = (q_values - target).square()
     if weights is not None:
@@ -53,7 +53,7 @@ def quantile_loss(
         quantiles: [C, B, M] of the batch's actions.
         fractions: [M] of the return's distribution below each quantile.
         target: [B, T]
-        weights: [B] importance weights of prioritised replay.
+        weights: [B] importance weights of prioritized replay.
     """
     error = target[:, None] - quantiles.unsqueeze(-1)
     side = (fractions[:, None] - (error.detach() < 0).to(error)).abs()

@@ -31,7 +31,7 @@ MOST_HEADER_BYTES = 1 << 20
 """Largest header of a policy's file, which may come from anywhere; ours have a few thousand."""
 _HEADER = "music_rllib_policy"
 MOST_BOUND = 1e15
-"""Largest bound of an action, as in training: the range of larger ones may be no float32."""
+"""Largest bound of an action, as in training: the range of larger ones may exceed float32."""
 
 Floats = npt.NDArray[np.float32]
 
@@ -42,7 +42,7 @@ class PolicyFileError(ValueError):
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyNetwork:
-    """A deterministic policy: normaliser, perceptron, tanh, the environment's bounds."""
+    """A deterministic policy: normalizer, perceptron, tanh, the environment's bounds."""
 
     weights: tuple[Floats, ...]
     """[outputs, inputs] of each layer, as torch keeps them."""
@@ -53,7 +53,7 @@ class PolicyNetwork:
     inverse_std: Floats
     """[I] factor on the shifted inputs."""
     clip: float
-    """Normalised inputs are clipped to plus/minus this."""
+    """Normalized inputs are clipped to plus/minus this."""
     low: Floats
     """[A] the environment's lowest actions."""
     high: Floats

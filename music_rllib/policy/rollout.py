@@ -27,7 +27,7 @@ class EpisodeResult:
     episode_return: float
     env_steps: int
     object_displacement: float | None
-    """Distance between the surroundings' first and last state (metres in the Fetch tasks)."""
+    """Distance between the surroundings' first and last state (meters in the Fetch tasks)."""
 
 
 class EpisodeStep(NamedTuple):

@@ -147,7 +147,7 @@ def _metric(study: Study, shown: Sequence[Claim]) -> str:
     measure = (shown[0] if shown else study.means[0]).measure
     area = " (area under the learning curve)" if measure.kind != "final" else ""
     text = f"Metric: {measure.words}{area}"
-    # A margin of success rates is none of returns.
+    # A margin of success rates does not apply to returns.
     margins = {one.margin for one in _alike(shown) if one.margin is not None}
     if margins:
         text += f"; equivalence margin {max(margins):g}"

@@ -121,7 +121,7 @@ def run(
     The options are those of `music-rllib run`.
 
     Raises:
-        BadInputError: Nothing was started; as other errors that name what to change.
+        BadInputError: Nothing was started; other errors also name what to change.
     """
     # `plan` needs none of it.
     with without_collections():
@@ -265,7 +265,7 @@ def _stopped_early(console: Console, stopped: KeyboardInterrupt | SystemExit) ->
     """The exit code for a signal that came while nothing was trained.
 
     Raises:
-        SystemExit: It was no signal.
+        SystemExit: The cause was not a signal.
     """
     if isinstance(stopped, KeyboardInterrupt):
         number = early.received or signal.SIGINT

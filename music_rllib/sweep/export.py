@@ -191,7 +191,7 @@ def _stage(sweep: OpenSweep, node: Node, folder: Path) -> dict[str, Any]:
         source = {"init_from": place | {"task": given.task.name}}
     elif given is not None:
         checkpoint = sweep.store.lasting_files(given.key)
-        if is_remote(sweep.storage):  # the copy that this is does not stay
+        if is_remote(sweep.storage):  # `checkpoint` is a temporary copy
             checkpoint = shutil.copytree(checkpoint, folder / "source", dirs_exist_ok=True)
         place = {"checkpoint": str(checkpoint.absolute())}
         source = {"init_from": place | {"task": given.task.name}}

@@ -192,7 +192,7 @@ class TACConfigBase(AlgorithmConfig):
 
     def update_from_dict(self, config_dict: Any) -> Self:
         """Update the settings as RLlib does, but raise ValueError for unknown keys."""
-        # RLlib also reads keys of its own dictionaries that are no attributes, and Tune adds keys
+        # RLlib also reads keys of its own dictionaries that are not attributes, and Tune adds keys
         # with double underscores.
         known = {*self.to_dict(), "multiagent"}
         unknown = [

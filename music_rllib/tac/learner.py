@@ -369,13 +369,13 @@ class TACLearner(TorchLearner):
         return self._music.priorities(frames, self._generator)
 
     def take_td_errors(self) -> NDArray[np.float32]:
-        """[K*B] absolute TD errors of the last call's transitions, for prioritised replay."""
+        """[K*B] absolute TD errors of the last call's transitions, for prioritized replay."""
         assert self._td_errors is not None
         errors: NDArray[np.float32] = self._td_errors.cpu().numpy()
         self._td_errors = None
         return errors
 
-    # -- normaliser, state ----------------------------------------------------------------
+    # -- normalizer, state ----------------------------------------------------------------
 
     def observe_inputs(self, inputs: Any) -> None:
         """Update the running normalizer by [B, I] new network inputs (numpy)."""

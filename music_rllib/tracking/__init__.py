@@ -1,1 +1,1 @@
-"""MLflow. Knows neither Ray nor the environments."""
+"""MLflow tracking; imports neither Ray nor the environments."""

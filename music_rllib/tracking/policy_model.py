@@ -55,7 +55,7 @@ def write_model(file: Path, folder: Path, *, run_id: str, model_id: str) -> Poli
     """Write an MLflow model of the policy in `file` to a new folder, and return the policy.
 
     Raises:
-        PolicyFileError: The file is no policy.
+        PolicyFileError: The file is not a policy.
     """
     from mlflow.models import Model
     from mlflow.models.model import MLMODEL_FILE_NAME

@@ -90,7 +90,7 @@ class Tracker:
         self.store = resolve_store(tracking_uri, storage)
         check_reachable(self.store)
         self._runs: WeakValueDictionary[str, RunQueue] = WeakValueDictionary()
-        """By node key; the sender keeps each until its run has ended and is delivered."""
+        """Queue by node key; the sender keeps each until its run has ended and is delivered."""
         self._undelivered: Pending | None = None
         self._view: dict[str, str] = {}
         self._name, self._place = sweep_name, below(redact(storage), sweep_name)

@@ -126,7 +126,7 @@ class Facets:
     setting: str
     """The setting whose values have subplots of their own; empty: only tasks have."""
     styles: Mapping[Condition, Style]
-    """Of all conditions of the stage; the same in each subplot."""
+    """Style of each condition of the stage; the same in each subplot."""
 
     @classmethod
     def of(cls, stage: StageRuns) -> Facets:
