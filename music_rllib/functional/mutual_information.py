@@ -37,6 +37,8 @@ def donsker_varadhan(joint: Tensor, marginals: Tensor, inside: Tensor | None = N
 
 SMILE_CLIP = 5.0
 """SMILE's tau: statistics of the product of marginals are clipped to [-tau, tau]."""
+AVERAGE_RATE = 0.01
+"""Share of an update in the moving average of MINE."""
 
 
 def other_bound(

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from music_rllib.functional.mutual_information import (
+    AVERAGE_RATE,
     donsker_varadhan,
     of_draw,
     other_bound,
@@ -23,7 +24,8 @@ from music_rllib.functional.mutual_information import (
     shuffle_time,
 )
 from music_rllib.kernels.adam import FlatParameters, FusedAdam
-from music_rllib.kernels.mutual_information import Data, Weights, bounds, learn
+from music_rllib.kernels.layers import Array
+from music_rllib.kernels.mutual_information import BOUNDS, Bound, Data, Weights, bounds, learn
 
 FAR = 10.0
 """Mean or standard deviation of an input above which a new network's tanh saturates: all statistics
@@ -32,8 +34,6 @@ are then 1 or all are -1, and the bound stays 0. Fetch's inputs are below 2."""
 
 NEGATIVES = 8
 """InfoNCE: shuffled pairs for each pair of one time."""
-AVERAGE_RATE = 0.01
-"""Share of an update in the moving average of MINE."""
 
 
 class MutualInformationEstimator(nn.Module):
@@ -58,7 +58,7 @@ class MutualInformationEstimator(nn.Module):
     log_average: Tensor
     """[] logarithm of the moving average of exp T(x, y'), with the bound `moving_average`."""
     compiled = True
-    """Whether compiled code computes bounds without gradient on a CPU; only `capped` ones."""
+    """Whether compiled code computes bounds without gradient on a CPU."""
 
     def __init__(
         self,
@@ -69,7 +69,6 @@ class MutualInformationEstimator(nn.Module):
     ) -> None:
         super().__init__()
         self.kind = bound
-        self.compiled = bound == "capped"
         if bound == "moving_average":
             self.register_buffer("log_average", torch.tensor(0.0))
         # Buffers move with the module's device; the indices are not part of its state.
@@ -137,11 +136,18 @@ class MutualInformationEstimator(nn.Module):
         if self.compiled and observations.device.type == "cpu" and not torch.is_grad_enabled():
             data = self.data(observations, permutations, inside)
             weights = Weights(*(parameter.detach().numpy() for parameter in self.parameters()))
-            return torch.from_numpy(bounds(data, weights))
+            return torch.from_numpy(bounds(data, self._bound(observations), weights))
         joint, marginals = self._statistics(observations, permutations, inside)
         if self.kind == "capped":
             return donsker_varadhan(joint, marginals[0], inside)
         return other_bound(self.kind, joint, marginals, inside)
+
+    def _bound(self, trajectories: Tensor | Array) -> Bound:
+        """The kind of bound for [N, T, ...] trajectories as compiled code takes it."""
+        frames = trajectories.shape[1]
+        negatives = max(min(NEGATIVES, frames - 1), 1) if self.kind == "infonce" else 1
+        average = self.log_average if self.kind == "moving_average" else torch.tensor(0.0)
+        return Bound(BOUNDS.index(self.kind), 1 + negatives, average.numpy())
 
     def _statistics(
         self, observations: Tensor, permutations: Tensor, inside: Tensor | None
@@ -196,7 +202,7 @@ class MutualInformationEstimator(nn.Module):
     def learn(
         self, pairs: Data, trajectories: Data, optimizer: FusedAdam, updates: int
     ) -> tuple[Tensor, Tensor]:
-        """Train on a CPU by compiled code; each of the K updates increases the mean bound.
+        """Train on a CPU by compiled code; each of the K updates decreases `loss`.
 
         Args:
             pairs: [K*B] pairs of frames, whose bounds are computed before their update.
@@ -214,7 +220,8 @@ class MutualInformationEstimator(nn.Module):
             for flat in (self._flat.values, self._flat.gradients)
         )
         step = optimizer.step_of(self._flat)
-        of_pairs, means = learn(pairs, trajectories, weights, gradients, step, updates)
+        bound = self._bound(trajectories.agent)
+        of_pairs, means = learn(pairs, trajectories, bound, weights, gradients, step, updates)
         return torch.from_numpy(of_pairs), torch.from_numpy(means)
 
     def data(self, observations: Tensor, permutations: Tensor, inside: Tensor | None) -> Data:

@@ -117,15 +117,13 @@ class Music:
         self, states: Tensor, followers: Tensor, drawn: Sequence[Any],
         trajectories: Mapping[str, Tensor], optimizer: FusedAdam,
     ) -> tuple[Tensor, dict[str, Tensor]]:  # fmt: skip
-        """K updates, by compiled code for the bound `capped`.
+        """K updates by compiled code.
 
         Takes states and next states [K, B, D], the K values of `draw`, and trajectories
         [K*N, T, D]. Returns [K, B] rewards, each minibatch's before its update, and metrics [K].
         """
         updates, rows = states.shape[:2]
         network = self._network
-        if network.kind != "capped":
-            return self._learn_by_autograd(states, followers, drawn, trajectories, optimizer)
         pairs = network.pairs(states, followers).flatten(0, 1)
         swaps = two_frames(len(pairs), sum(drawn, ()), pairs.device)
         permutations, inside = trajectories["permutations"], trajectories.get("inside")
@@ -137,22 +135,6 @@ class Music:
         )
         rewards = intrinsic_reward(bounds, self._settings.reward_scale)
         return rewards.view(updates, rows), {names.MI_BOUND: means}
-
-    def _learn_by_autograd(
-        self, states: Tensor, followers: Tensor, drawn: Sequence[Any],
-        trajectories: Mapping[str, Tensor], optimizer: FusedAdam,
-    ) -> tuple[Tensor, dict[str, Tensor]]:  # fmt: skip
-        rewards, bounds = [], []
-        parts = {name: each.tensor_split(len(drawn)) for name, each in trajectories.items()}
-        for k, of_update in enumerate(drawn):
-            rewards.append(self.reward(states[k], followers[k], of_update))
-            with torch.enable_grad():
-                loss, metrics = self.loss({name: each[k] for name, each in parts.items()})
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-            bounds.append(metrics[names.MI_BOUND])
-        return torch.stack(rewards), {names.MI_BOUND: torch.stack(bounds)}
 
     def observe(
         self, episodes: Sequence[Trajectory], states: Tensor, followers: Tensor,

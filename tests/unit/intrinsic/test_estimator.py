@@ -143,6 +143,39 @@ def test_compiled_bound_and_gradients_equal_autograd() -> None:
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.parametrize("frames", [11, 2])
+@pytest.mark.parametrize("bound", ["moving_average", "nwj", "smile", "infonce"])
+def test_compiled_losses_without_a_cap_equal_autograd(bound: str, frames: int) -> None:
+    torch.manual_seed(0)
+    estimator = MutualInformationEstimator(range(3), range(3, 5), hidden_size=20, bound=bound)
+    generator = torch.Generator().manual_seed(1)
+    inside = torch.arange(frames) < torch.tensor([[frames], [2], [min(7, frames)], [frames]])
+    observations = 3.0 * torch.randn(4, frames, 5, generator=generator)
+    permutations = time_permutations(4, frames, generator, inside=inside)
+    expected = estimator.bound(observations, permutations, inside).detach()
+    before = copy.deepcopy(estimator.state_dict())
+    loss, mean = estimator.loss(observations, permutations, inside)
+    gradients = torch.autograd.grad(loss, list(estimator.parameters()))
+    average = copy.deepcopy(estimator.state_dict().get("log_average"))
+    estimator.load_state_dict(before)
+    with torch.no_grad():
+        found = estimator.bound(observations, permutations, inside)
+    torch.testing.assert_close(found, expected)
+    pairs = observations[:, :2]
+    swaps = time_permutations(4, 2, generator)
+    of_pairs, means, ours = trained_by(
+        estimator,
+        estimator.data(pairs, swaps, None),
+        estimator.data(observations, permutations, inside),
+    )
+    torch.testing.assert_close(of_pairs, estimator.bound(pairs, swaps).detach())
+    torch.testing.assert_close(means, mean[None])
+    for one, other in zip(ours, gradients, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-6)
+    if average is not None:
+        torch.testing.assert_close(estimator.log_average, average)
+
+
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf])
 def test_non_finite_values_spread_as_in_autograd(bad: float) -> None:
     estimator = make_estimator(2, 2, hidden_size=8)
