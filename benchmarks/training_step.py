@@ -38,6 +38,11 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "TAC, HER, 3 x 128, frozen estimator": SMALL | {"estimator": "frozen"},
     "TAC, HER, 3 x 128, trained estimator": SMALL | {"estimator": "trained"},
 }
+BOUNDS = {
+    f"TAC, HER, estimator, {bound}": HER | {"estimator": "trained", "bound": bound}
+    for bound in ("capped", "moving_average", "nwj", "smile", "infonce")
+}
+VARIANTS |= BOUNDS
 AVERAGED: dict[str, Any] = SMALL | {"bootstrap": "critics", "policy_critic": "mean"}
 DROPPED = {"critics": 5, "quantiles": 25, "dropped_quantiles": 2}
 CRITICS: dict[str, dict[str, Any]] = {
@@ -59,6 +64,7 @@ PEERS: dict[str, tuple[str, float | None]] = {
     "TAC, HER, 3 x 128, frozen estimator": ("TAC, HER, 3 x 128", 1.03),
     "TAC, HER, 3 x 128, trained estimator": ("TAC, HER, 3 x 128", 1.15),
 }
+PEERS |= {name: ("TAC, HER", 1.4) for name in BOUNDS}
 """Reference of a variant's time, and the target."""
 SIZES = {"TAC, HER": 256, "TAC, HER, 3 x 128": 128}
 """Variants that are compared with JAX and matrix products, and the width of their layers."""
@@ -69,6 +75,7 @@ OF_PRODUCTS = {128: 1.5, 256: 1.35}
 def algorithm(
     hindsight_k: float = 0.0,
     estimator: str = "none",
+    bound: str = "capped",
     transitions: int = 10_000,
     direct: bool = True,
     gpus: float = 0.0,
@@ -85,6 +92,7 @@ def algorithm(
         agent_indices=range(3),
         surrounding_indices=range(3, 6),
         estimator=estimator,
+        bound=bound,
         mi_reward_weight=weight,
     )
     algo: TAC = config.build_algo()
