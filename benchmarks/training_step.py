@@ -64,7 +64,7 @@ PEERS: dict[str, tuple[str, float | None]] = {
     "TAC, HER, 3 x 128, frozen estimator": ("TAC, HER, 3 x 128", 1.03),
     "TAC, HER, 3 x 128, trained estimator": ("TAC, HER, 3 x 128", 1.15),
 }
-PEERS |= {name: ("TAC, HER", 1.4) for name in BOUNDS}
+PEERS |= dict.fromkeys(BOUNDS, ("TAC, HER", 1.4))
 """Reference of a variant's time, and the target."""
 SIZES = {"TAC, HER": 256, "TAC, HER, 3 x 128": 128}
 """Variants that are compared with JAX and matrix products, and the width of their layers."""

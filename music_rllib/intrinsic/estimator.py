@@ -32,7 +32,7 @@ FAR = 10.0
 are then 1 or all are -1, and the bound stays 0. Fetch's inputs are below 2."""
 
 
-NEGATIVES = 8
+NEGATIVES = 5
 """InfoNCE: shuffled pairs for each pair of one time."""
 
 

@@ -106,7 +106,7 @@ class MusicSettings(StrictModel):
     bound: Literal["capped", "moving_average", "nwj", "infonce", "smile"] = "capped"
     """Bound on the information that the estimator increases. `capped`: Donsker-Varadhan with
     statistics in [-1, 1], as in the original; the others have no cap: Donsker-Varadhan with a
-    moving average in its gradient (MINE), NWJ, InfoNCE with 8 shuffled pairs, and SMILE."""
+    moving average in its gradient (MINE), NWJ, InfoNCE with 5 shuffled pairs, and SMILE."""
     reward_scale: float = Field(5000.0, gt=0)
     """Factor of the bound before it is clipped to [0, 1] and shifted by -1. Higher: the smallest
     influence earns the whole reward; lower: only a large influence earns any."""

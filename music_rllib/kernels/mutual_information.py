@@ -178,25 +178,25 @@ def _forward(
 
 
 @_inner
-def _normalize(statistics: Array, t: int) -> None:
-    """Subtract the logarithm of the sum of exp of a frame's statistics from each of them."""
-    top, total = statistics[0, t], 0.0
+def _shares(statistics: Array, t: int) -> float:
+    """Replace a frame's statistics by their shares of the sum of exp; the log of the own pair's."""
+    own, top, total = statistics[0, t], statistics[0, t], 0.0
     for s in range(len(statistics)):
         top = max(top, statistics[s, t])
     for s in range(len(statistics)):
-        total += math.exp(statistics[s, t] - top)
+        statistics[s, t] = math.exp(statistics[s, t] - top)
+        total += statistics[s, t]
     for s in range(len(statistics)):
-        statistics[s, t] -= top + math.log(total)
+        statistics[s, t] /= total
+    return own - top - math.log(total)
 
 
 @_inner
 def _value(kind: int, statistics: Array, last: int) -> tuple[float, float, float]:
-    """The bound in nats, and a and b with sum exp T(x, y') = exp(a) b. Normalize for `infonce`."""
+    """The bound in nats, and a and b with sum exp T(x, y') = exp(a) b; for `infonce`, shares."""
     mean, top, total = 0.0, 0.0, 0.0
     for t in range(last):
-        if kind == _INFONCE:
-            _normalize(statistics, t)
-        mean += statistics[0, t]
+        mean += _shares(statistics, t) if kind == _INFONCE else statistics[0, t]
     if kind == _INFONCE:
         return mean / last + math.log(len(statistics)), top, total
     if kind in (_MOVING_AVERAGE, _NWJ):
@@ -240,8 +240,7 @@ def _slopes(
             statistics[1, t] = 1.0 / ((1.0 + math.exp(-other)) * frames)
         else:
             for s in range(len(statistics)):
-                share = math.exp(statistics[s, t])
-                statistics[s, t] = (share - (s == 0)) / (last * count)
+                statistics[s, t] = (statistics[s, t] - (s == 0)) / (last * count)
 
 
 @_inner
