@@ -188,7 +188,8 @@ def _shares(statistics: Array, t: int) -> float:
         total += statistics[s, t]
     for s in range(len(statistics)):
         statistics[s, t] /= total
-    return own - top - math.log(total)
+    log_share: float = own - top - math.log(total)
+    return log_share
 
 
 @_inner
