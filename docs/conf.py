@@ -1,6 +1,6 @@
-"""The documentation site: `make docs`. It opens from disk, with its search, and fetches nothing.
+"""The documentation site: `make docs`. It works from disk, including its search, without a network.
 
-Its pages are copies of docs/ and of what `PAGES` adds, made by build_site.py.
+Its pages are copies of docs/ and of the files in `PAGES`, made by build_site.py.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ html_title = "music_rllib"
 html_copy_source = False
 html_show_sphinx = False
 html_show_copyright = False
-# Summaries are fetched, which a browser refuses on pages from a disk.
+# Search loads page summaries by requests, which browsers refuse for pages on a disk.
 html_show_search_summary = False
 myst_heading_anchors = 4
 autodoc_member_order = "bysource"
@@ -30,7 +30,7 @@ autodoc_default_options = {"members": True, "exclude-members": "model_config"}
 suppress_warnings = ["misc.highlighting_failure", "myst.header"]
 
 PAGES = {"index": "README.md", "changelog": "CHANGELOG.md", "searching": "docs/search.md"}
-"""Of the site, and their files; `search` is Sphinx's own page."""
+"""Pages of the site and their files; `search` is Sphinx's own page."""
 CONTENTS = """
 ```{toctree}
 :hidden:
@@ -75,7 +75,7 @@ _LINK = re.compile(r"(!?\[[^\]]*\])\(([^)\s:#]+)(#[^)]*)?\)")
 
 
 def _with_links_of_the_site(app: Any, page: str, source: list[str]) -> None:
-    """Links to files become links to their pages, or names where they have none."""
+    """Turn links to files into links to their pages, or into plain names if they have none."""
     above = (ROOT / PAGES.get(page, f"docs/{page}.md")).parent
 
     def link(found: re.Match[str]) -> str:
@@ -92,5 +92,5 @@ def _with_links_of_the_site(app: Any, page: str, source: list[str]) -> None:
 
 
 def setup(app: Any) -> None:
-    """Called by Sphinx."""
+    """Connect the extension; Sphinx calls this."""
     app.connect("source-read", _with_links_of_the_site)

@@ -231,7 +231,7 @@ Row = tuple[str, str, str, str]
 
 
 def dimensions() -> Iterator[Row]:
-    """The kinds of entries of a space; what several have in common stands once."""
+    """The kinds of entries of a space; their common fields are listed once."""
     seen = set()
     for kind in (FloatRange, IntRange, Choice):
         for row in rows(kind, "", skip=("when",)):
@@ -266,7 +266,7 @@ def variants() -> str:
 
 
 def init_from() -> Iterator[Row]:
-    """`init_from` and its keys; the YAML takes a bare name too, which the model does not know."""
+    """`init_from` and its keys; YAML also accepts a bare name, which the model does not have."""
     field = StageHeader.model_fields["init_from"]
     kind = "name, mapping or null"
     yield "init_from", kind, default_of(field), docstrings(StageHeader)["init_from"]
@@ -291,7 +291,7 @@ def rows(
 
 
 def default_of(field: FieldInfo) -> str:
-    """The default as it would stand in YAML."""
+    """The default as written in YAML."""
     if field.is_required():
         return "required"
     value = field.get_default(call_default_factory=True)
@@ -319,7 +319,7 @@ _SIGNS = (
 
 
 def type_of(annotation: Any) -> str:
-    """An annotation in a person's words, with the bounds that it carries."""
+    """An annotation in words, with its bounds."""
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         return _annotated(arguments[0], arguments[1:])
@@ -356,7 +356,7 @@ def _annotated(inner: Any, metadata: tuple[Any, ...]) -> str:
 
 
 def _flat(metadata: tuple[Any, ...]) -> Iterator[Any]:
-    """What is annotated, with the constraints inside of pydantic's `Field(...)` taken out."""
+    """The metadata of an annotation, with pydantic's `Field(...)` replaced by its constraints."""
     for item in metadata:
         yield from item.metadata if isinstance(item, FieldInfo) else (item,)
 
