@@ -469,7 +469,7 @@ def test_sweeps_that_the_files_name_are_there() -> None:
     assert sweep.mlflow.tracking_uri == "http://mlflow:5000"
 
 
-def test_image_has_what_it_copies_and_runs_as_nobody_special() -> None:
+def test_image_has_the_files_that_it_copies_and_runs_without_root() -> None:
     text = (CLUSTER / "Dockerfile").read_text()
     allowed = [
         line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line[:1] == "!"

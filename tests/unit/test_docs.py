@@ -55,7 +55,7 @@ def test_links_between_pages_lead_somewhere(page: Path) -> None:
             assert anchor in anchors(path.read_text(encoding="utf-8")), f"{page.name}: {target}"
 
 
-def test_every_built_in_task_is_described_as_it_is() -> None:
+def test_every_built_in_task_matches_its_description() -> None:
     for task in BUILT_IN_TASKS.values():
         (row,) = re.findall(
             rf"^\| `{re.escape(task.name)}` \|.*$", TEXTS["add_an_environment.md"], re.MULTILINE

@@ -142,7 +142,7 @@ def check(words: list[str]) -> None:
 
 
 @pytest.mark.parametrize("block", snippets("sh"))
-def test_commands_are_what_the_programs_take(
+def test_the_programs_accept_the_commands(
     block: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -189,7 +189,7 @@ def test_yaml_is_a_sweep_or_a_part_of_the_one_before_it(page: Path, tmp_path: Pa
 
 
 @pytest.mark.parametrize("block", snippets("python"))
-def test_python_compiles_and_finds_what_it_imports(block: str) -> None:
+def test_python_compiles_and_its_imports_exist(block: str) -> None:
     module = ast.parse(block)
     imports = [line for line in module.body if isinstance(line, ast.Import | ast.ImportFrom)]
     exec(compile(ast.Module([*imports], []), "snippet", "exec"), {})

@@ -86,7 +86,7 @@ def test_lower_layers_load_no_ray() -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_a_driver_loads_only_what_it_needs() -> None:
+def test_a_driver_loads_only_the_modules_that_it_needs() -> None:
     """Each import takes at least a third of a second, and memory for the whole sweep."""
     never = ["torch", "scipy.stats", "matplotlib", "optuna"]  # optuna: without a search
     code = (
@@ -122,7 +122,7 @@ def test_a_run_begins_without_torchs_compiler() -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_the_rules_name_what_exists() -> None:
+def test_the_rules_name_existing_modules() -> None:
     """A rule about a renamed module would check nothing."""
     for part in (*PURE, *LIGHT, *MAY_LOAD_RAY):
         assert any(_is_in(module, part) for module in MODULES) or part == "", part

@@ -89,7 +89,7 @@ def command(program: Any, *arguments: str) -> tuple[int, str, str]:
 
 @pytest.mark.thorough
 @pytest.mark.timeout(2 * PATIENCE)
-def test_a_search_stopped_and_resumed_and_what_its_commands_say(
+def test_a_stopped_search_resumes_and_its_commands_show_it(
     sweep_program: Any, sweep_document: Document, mlflow_runs: Callable[[], Any], tmp_path: Path
 ) -> None:
     sweep_program.write(searched(sweep_document))

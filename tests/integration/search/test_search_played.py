@@ -353,7 +353,7 @@ def test_baselines_are_ranked_with_the_best(tmp_path: Path) -> None:
     assert len(runs) == 2 * len(ranked)
 
 
-def test_importance_names_what_matters(tmp_path: Path) -> None:
+def test_importance_names_the_settings_that_matter(tmp_path: Path) -> None:
     def formula(run: RunSettings, share: float) -> float:
         return share * float(run.tac.entropic_index) / 3  # type: ignore[arg-type]
 

@@ -109,7 +109,7 @@ def test_acts_like_the_networks(
     np.testing.assert_allclose(alone, expected[2], atol=2e-6)
 
 
-def test_says_what_it_is_for(tmp_path: Path) -> None:
+def test_a_policy_describes_its_run(tmp_path: Path) -> None:
     policy = load_policy(Trained(_run(max_episode_steps=20)).write(tmp_path))
     assert (policy.task, policy.seed, policy.variant) == (REACH, 3, "tac")
     assert (policy.node_key, policy.env_steps, policy.max_episode_steps) == (KEY, 500, 20)
@@ -174,7 +174,7 @@ def test_scales_to_the_environments_bounds() -> None:
         ("far away", "numbers"),
     ],
 )
-def test_refuses_what_is_no_observation(tmp_path: Path, observation: Any, complaint: str) -> None:
+def test_invalid_observations_are_refused(tmp_path: Path, observation: Any, complaint: str) -> None:
     policy = load_policy(Trained(_run()).write(tmp_path))
     with pytest.raises(ValueError, match=complaint):
         policy.act(observation)

@@ -429,7 +429,7 @@ def test_per_draws_by_td_error_and_weights_undo_it() -> None:
     assert batch.weights.max() == 1.0
 
 
-def test_per_forgets_what_was_overwritten_and_keeps_hindsight_inside_its_episode() -> None:
+def test_per_forgets_overwritten_rows_and_keeps_hindsight_inside_its_episode() -> None:
     replay = TrajectoryReplay(
         LAYOUT, 10, np.random.default_rng(0), goal_reward=matches, hindsight_k=4, td_exponent=0.6
     )

@@ -465,7 +465,7 @@ def test_no_point_is_tried_twice(sampler: str, space: Document, trials: int) -> 
     assert settings.count == (1000 if space in (ONE_OR_MANY, FEW_OR_MANY) else trials)
 
 
-def test_a_search_with_few_points_prints_where_it_ends(tmp_path: Path) -> None:
+def test_a_search_with_few_points_prints_its_last_trial(tmp_path: Path) -> None:
     path = tmp_path / "sweep.yaml"
     path.write_text(yaml.safe_dump(document({"space": CHOICES, "trials": 20})))
     (line,) = warnings_of(load_config(path))

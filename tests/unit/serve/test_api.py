@@ -222,7 +222,7 @@ def test_without_a_token_only_requests_to_this_machine_are_answered(url: str) ->
         assert "Host header" in answer.json()["error"]
 
 
-def test_a_token_is_asked_for_where_there_is_one() -> None:
+def test_a_token_is_required_if_there_is_one() -> None:
     with serving(token="hunter2") as url:
         elsewhere = {"Host": "policy.example", "Authorization": "Bearer hunter2"}
         assert requests.get(f"{url}/policy", headers=elsewhere, timeout=60).ok

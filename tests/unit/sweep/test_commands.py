@@ -396,7 +396,7 @@ def test_returns_of_different_tasks_are_never_averaged(
 
 
 @IN_A_BUCKET
-def test_clean_lists_and_deletes_what_no_other_sweep_has(
+def test_clean_lists_and_deletes_files_that_no_other_sweep_has(
     storage: str, tmp_path: Path, program: Program
 ) -> None:
     sweep = played(storage, tmp_path)
@@ -631,7 +631,7 @@ SEARCH: dict[str, Any] = {
 }
 
 
-def test_clean_keeps_what_another_sweep_of_the_same_study_counts_on(
+def test_clean_keeps_runs_that_another_sweep_of_the_same_study_needs(
     storage: str, tmp_path: Path, program: Program
 ) -> None:
     """The plan of each sweep has only the trials that it judged itself."""
@@ -919,7 +919,7 @@ def test_what_a_search_has_asked_for_before_is_verified_too(tmp_path: Path) -> N
         opened(storage, tmp_path, stages=stages, seeds=[0])
 
 
-def test_a_search_asks_for_no_more_once_its_finalists_run(tmp_path: Path) -> None:
+def test_a_search_requests_no_more_runs_once_its_finalists_run(tmp_path: Path) -> None:
     """The unused budget of trials that were stopped early is not counted as remaining."""
     search = {
         "space": {"tac.lr": {"float": [1e-4, 1e-2]}},

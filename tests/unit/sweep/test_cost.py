@@ -47,7 +47,7 @@ def test_runs_of_one_task_differ_in_cost_by_their_networks_and_not_by_q(tmp_path
     assert sum(kind.runs for kind in kinds(tmp_path, finished=5)) == 16 - 5
 
 
-def test_a_search_counts_with_what_it_runs_at_most(tmp_path: Path) -> None:
+def test_a_search_counts_with_its_largest_number_of_runs(tmp_path: Path) -> None:
     search = {
         "trials": 5,
         "space": {"tac.alpha": {"float": [0.01, 0.1], "log": True}},

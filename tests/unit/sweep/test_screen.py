@@ -74,7 +74,7 @@ def report(env_steps: int, seconds: float, **metrics: float) -> Report:
     return Report(env_steps=env_steps, seconds=seconds, timestamp_ms=0, metrics=metrics)
 
 
-def test_the_plan_counts_runs_budgets_and_what_is_finished(config: SweepConfig, plan: Plan) -> None:
+def test_the_plan_counts_runs_budgets_and_finished_runs(config: SweepConfig, plan: Plan) -> None:
     text = shown(plan_view(config, plan, {plan.nodes[0].key}))
     rows = {line.split()[0]: line.split()[1:] for line in text.splitlines()}
     assert rows["finetune"] == ["2", "4", "5,000", "20,000", "0"]
@@ -97,7 +97,7 @@ def test_settings_that_vary_together_are_shown_together(tmp_path: Path) -> None:
     assert {label.split("/")[-2] for label in labels} == {point(1, 0.15), point(1.5, 0.05)}
 
 
-def test_the_plan_shows_what_a_control_makes_of_alpha_at_each_q(tmp_path: Path) -> None:
+def test_the_plan_shows_the_alpha_of_a_control_at_each_q(tmp_path: Path) -> None:
     alpha = {"value": 0.05, "matched_width": 0.1}
     ramp = {"schedule": "linear", "start": 1.0, "end": 2.0}
     stages = [

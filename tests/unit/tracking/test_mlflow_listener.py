@@ -41,7 +41,7 @@ def plan(folder: Path, tasks: list[str]) -> Plan:
     return make_plan(config(folder, tasks))
 
 
-def test_a_run_s_name_begins_with_what_differs(tmp_path: Path) -> None:
+def test_a_run_s_name_begins_with_its_varied_settings(tmp_path: Path) -> None:
     called = [run_name(node) for node in plan(tmp_path, ["FetchPush", "FetchSlide"]).nodes]
     assert len(set(called)) == len(called)
     assert "seed 1 FetchSlide pretrain" in called

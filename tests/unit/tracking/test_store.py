@@ -151,7 +151,7 @@ def test_a_wrong_uri_is_refused_with_its_rule(uri: str, rule: str) -> None:
     assert rule in str(raised.value)
 
 
-def test_what_the_environment_sets_is_named_and_completes_what_a_sweep_kept(
+def test_variables_are_named_and_complete_the_settings_that_a_sweep_kept(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("MLFLOW_TRACKING_URI", "file:///mlruns")
