@@ -67,7 +67,7 @@ _SECRETS = tuple(
         {_VALUE}""",
     )
 )
-_CURL = re.compile(r"(?:\b(?:curl|wget)\b|--(?:proxy-)?user\b)(?:\\\n|[^\n])*", re.I)
+_CURL = re.compile(r"(?:\b(?:curl|wget)\b|--(?:proxy-)?user\b(?!-))(?:\\\n|[^\n])*", re.I)
 """A line from such a command or option on. `-u` of other commands takes no password."""
 _CURL_USER = re.compile(
     r"""(?P<name>(?<![\w\-])(?:-[a-z]{0,9}?u|--(?:proxy-)?user\b(?!-))(?:["'],)?[ \t=]{0,9}["']?

@@ -63,6 +63,7 @@ from tests.kept_sweep import kept_sweep
         ("curl h \\\n  -u me:pw\nsort -u a:b", "curl h \\\n  -u me:***\nsort -u a:b"),
         ("python -u train.py:12 | sort -u a:b", "python -u train.py:12 | sort -u a:b"),
         ("python -u x.py --user me:pw", "python -u x.py --user me:***"),
+        ("python x --user-data d -u a:12", "python x --user-data d -u a:12"),
         ("mysqldump -P 3306 -uroot -ppw -p db", "mysqldump -P 3306 -uroot -p*** -p db"),
         ("mysql -P3306 -p db --port=1", "mysql -P3306 -p db --port=1"),
         ("['mysql', '-p', 'db']", "['mysql', '-p', 'db']"),
