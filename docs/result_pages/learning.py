@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from docs.result_pages.figures import figure
-from docs.result_pages.summary import complete_studies
+from docs.result_pages.summary import STUDIES, complete_studies
 from music_rllib import names
 from music_rllib.report.figures.choice import Drawing
 from music_rllib.report.figures.draw import files
@@ -54,7 +54,7 @@ def overview() -> bytes:
         legend = _legend(sweep)
         first = study.planned[0]
         curves = [_shifted(sweep, curve(sweep, c, first.task, SUCCESS.name)) for c in legend]
-        title = f"{first.task}, {first.contrast.seeds[0]} seeds"
+        title = f"{first.task}, {first.contrast.seeds[0]} seeds\n{STUDIES[sweep.name]}"
         subplots.append(_subplot(title, curves, legend))
         entries |= dict(legend.values())
     return files(subplots, list(entries.items()))[".png"]
@@ -72,11 +72,9 @@ def _legend(sweep: Sweep) -> dict[Condition, tuple[str, Style]]:
 def _entry(stage: StageRuns, condition: Condition, style: Style) -> tuple[str, Style]:
     if not stage.has_task_reward:
         return PRETRAINING
-    from_scratch = stage.variant == "tac"
-    if from_scratch and len({other.entropic_index for other in stage.conditions}) == 1:
+    if stage.variant == "tac" and len({one.entropic_index for one in stage.conditions}) == 1:
         return SCRATCH
-    reward = "HER alone" if from_scratch else "MUSIC-r"
-    return f"{reward}, q = {condition.entropic_index}", style
+    return f"q = {condition.entropic_index}", style
 
 
 def _subplot(

@@ -97,8 +97,8 @@ def _alike(claims: Sequence[Claim]) -> str:
     alike = [claim for claim in claims if claim.verdict is Verdict.EQUIVALENT]
     seeds = min(claim.contrast.seeds[0] for claim in claims)
     pairs = " and ".join(f"{claim.first} to {claim.second}" for claim in alike)
-    single = f"{pairs} {'are' if len(alike) > 1 else 'is'} equivalent"
-    who = "all three q are equivalent" if len(alike) == len(claims) else single
+    single = f"{alike[0].first} and {alike[0].second}" if len(alike) == 1 else pairs
+    who = f"{'all three q' if len(alike) == len(claims) else single} are equivalent"
     within = f"on {claims[0].task} {who} within {claims[0].margin:g}"
     few = ", too few to exclude rare collapses" if seeds < SEEDS_FOR_COLLAPSES else ""
     return f"{within} ({seeds} seeds{few})"

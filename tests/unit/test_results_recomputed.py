@@ -24,6 +24,7 @@ MEAN, SAMPLED = "evaluation/success_rate", "training/success_rate"
 ENTROPIES = ("entropy/shannon", "entropy/tsallis")
 JOINT, MUSIC = "joint entropy, HER alone", "per-dimension entropy, MUSIC-r"
 STUDIES = {  # export and compared stage
+    ("FetchPush", JOINT): ("joint-her", "her"),
     ("FetchPush", MUSIC): ("claims-push", "music-r"),
     ("FetchPickAndPlace", MUSIC): ("claims-pick-and-place", "music-r"),
     ("FetchSlide", MUSIC): ("claims-slide", "music-r"),
@@ -152,7 +153,7 @@ def in_words(claim: Claim, *, planned: bool) -> str:
 
 
 def two_decimals(value: float, sign: str = "") -> str:
-    return f"{round(value, 2) + 0.0:{sign}.2f}"
+    return f"{value:{sign}.2f}"
 
 
 def p_text(p: float) -> str:

@@ -104,7 +104,8 @@ def _settings(font: float, colors: tuple[str, str, str]) -> Any:
 def drawn_figure(subplots: Sequence[Subplot], legend: Legend, width: float) -> Figure:
     """A figure with the subplots in rows and the legend below them."""
     has_rows = any(subplot.height > HEIGHT for subplot in subplots)
-    columns = min(len(subplots), 2 if has_rows else 3) if width > _ON_PAGE else 1
+    most = 2 if has_rows or len(subplots) == 4 else 3
+    columns = min(len(subplots), most) if width > _ON_PAGE else 1
     rows = [subplots[i : i + columns] for i in range(0, len(subplots), columns)]
     scale = min(1.1, max(0.8, width / (columns * _ON_PAGE)))
     heights = [scale * max(subplot.height for subplot in row) for row in rows]
