@@ -111,7 +111,7 @@ class IntrinsicReward(nn.Module, ABC):
             learning: whether the bonuses count for the scale.
 
         Raises:
-            ValueError: `bonus` returned another shape.
+            ValueError: `bonus` returned another shape, or numbers that are negative or not finite.
         """
         bonus = self.bonus(batch)
         if bonus.shape != batch.states.shape[:1]:
@@ -119,6 +119,10 @@ class IntrinsicReward(nn.Module, ABC):
                 f"{type(self).__name__}.bonus must return one number for each transition, of shape "
                 f"{tuple(batch.states.shape[:1])}, got shape {tuple(bonus.shape)}"
             )
+        wrong = bonus[~((bonus >= 0.0) & (bonus < torch.inf))]
+        if len(wrong):
+            rule = f"{type(self).__name__}.bonus must return finite numbers >= 0"
+            raise ValueError(f"{rule}, got {float(wrong[0])}")
         if self.scale is not None:
             return (bonus / self.scale).clamp(0.0, 1.0) - 1.0, bonus
         if learning:

@@ -45,20 +45,31 @@ def reward_class(name: str) -> type[IntrinsicReward]:
     return found
 
 
+def check_reward(settings: IntrinsicSettings) -> type[IntrinsicReward]:
+    """The class of a reward whose settings fit its constructor.
+
+    Raises:
+        ValueError: As `reward_class`, or the settings do not fit.
+    """
+    assert settings.reward is not None
+    kind = reward_class(settings.reward)
+    try:
+        inspect.signature(kind).bind(None, **settings.settings)
+    except TypeError as error:
+        raise ValueError(f"intrinsic.settings must fit {settings.reward}: {error}") from error
+    return kind
+
+
 def make_reward(settings: IntrinsicSettings, sizes: Sizes, seed: int) -> IntrinsicReward:
     """A reward with initial weights that depend on the seed only.
 
     Raises:
         ValueError: The class, its settings or the environment do not fit.
     """
-    assert settings.reward is not None
-    kind = reward_class(settings.reward)
+    kind = check_reward(settings)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        try:
-            return kind(sizes, **settings.settings)
-        except TypeError as error:
-            raise ValueError(f"intrinsic.settings must fit {settings.reward}: {error}") from error
+        return kind(sizes, **settings.settings)
 
 
 PERIOD = 4

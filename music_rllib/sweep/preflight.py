@@ -84,7 +84,8 @@ def fingerprints(plan: Plan) -> dict[str, Fingerprint]:
     """The fingerprint of each task's environment, by `RunSettings.code`; imports users' modules.
 
     Raises:
-        TaskError: The module of an environment or of an intrinsic reward can't be imported.
+        TaskError: The module of an environment or of an intrinsic reward can't be imported, or the
+            reward's class or settings do not fit.
     """
     found = {}
     for code, run in {run.code: run for run in plan.settings}.items():
@@ -94,6 +95,16 @@ def fingerprints(plan: Plan) -> dict[str, Fingerprint]:
             own = f" and intrinsic.reward {run.intrinsic.reward}" if run.own_modules else ""
             place = f"environments.{run.task.name}{own}"
             raise TaskError(f"{place} must be importable: {error}") from error
+    own_rewards = {
+        run.intrinsic.identity: run.intrinsic for run in plan.settings if run.own_modules
+    }
+    for settings in own_rewards.values():
+        from music_rllib.intrinsic.relabeling import check_reward
+
+        try:
+            check_reward(settings)
+        except ValueError as error:
+            raise TaskError(str(error)) from error
     return found
 
 

@@ -234,6 +234,18 @@ def test_a_bonus_of_another_shape_is_refused_instead_of_broadcast() -> None:
     assert reward_class(OWN).__name__ == "Speed"
 
 
+@pytest.mark.parametrize("number", [-0.5, torch.nan, torch.inf])
+def test_a_bonus_that_is_negative_or_not_finite_is_refused(number: float) -> None:
+    class Wrong(Speed):
+        def bonus(self, batch: Batch) -> Tensor:
+            bonus = super().bonus(batch)
+            bonus[3] = number
+            return bonus
+
+    with pytest.raises(ValueError, match=f"must return finite numbers >= 0, got {number}"):
+        RewardLearner(Wrong(SIZES), 1e-3, frozen=False).learn(batch(), 1)
+
+
 @pytest.mark.parametrize("name", BUILT_IN)
 def test_the_checked_settings_are_those_of_the_class(name: str) -> None:
     module, _, cls = BUILT_IN[name].partition(":")

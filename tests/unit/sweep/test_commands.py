@@ -859,6 +859,30 @@ def test_plan_as_json_with_more_seeds(
     assert (bad.code, "--seeds must be a number of seeds" in bad.errors) == (2, True)
 
 
+@pytest.mark.parametrize(
+    ("reward", "message"),
+    [
+        ("speeds:Missing", "must name a subclass of IntrinsicReward in speeds"),
+        ("speeds:Speed", "intrinsic.settings must fit speeds:Speed: missing a required argument"),
+    ],
+)
+def test_plan_refuses_an_own_reward_that_does_not_fit(
+    reward: str, message: str, tmp_path: Path, program: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("speeds.py").write_text(
+        "from music_rllib.intrinsic.interface import IntrinsicReward\n"
+        "class Speed(IntrinsicReward):\n"
+        "    def __init__(self, sizes, *, power):\n"
+        "        super().__init__(sizes)\n"
+        "    def bonus(self, batch):\n"
+        "        return batch.states[:, 0]\n"
+    )
+    Path("sweep.yaml").write_text(yaml.safe_dump(SWEEP))
+    refused = program("plan", "sweep.yaml", f"intrinsic.reward={reward}")
+    assert (refused.code, message in refused.errors) == (2, True)
+
+
 @IN_A_BUCKET
 def test_a_damaged_run_is_named_by_every_command_and_trained_again_when_asked(
     storage: str, tmp_path: Path, program: Program
