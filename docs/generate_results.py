@@ -10,7 +10,8 @@ trained them; otherwise it has the runs of the export docs/results/data/NAME. KI
 
 - without NAME, over the three studies of q: `headline`, `summary`, `sampled` or `robustness`;
 - for a planned study: `verdict` (with the hypothesis), `answer`, `outcomes` (with stages),
-  `seeds`, `cells`, `figure` (with its name), `learning`, `equal-total`, `hours` or `progress`;
+  `seeds`, `cells`, `figure` (with its name), `learning`, `arms`, `equal-total`, `hours` or
+  `progress`;
 - for any sweep: `totals` (with a pretrained stage and one from scratch), `runs`, `provenance`,
   `success`, `stages` or `curves` (with stages, if not all), `metric` (with metrics), or `search`.
 
@@ -44,7 +45,7 @@ from docs.result_pages.summary import (
     sampled_sentence,
     summary_table,
 )
-from docs.result_pages.totals import totals_table
+from docs.result_pages.totals import arms_table, totals_table
 
 FOLDER = Path(__file__).parent
 PAGES = {"results.md": "page.md", "lab/claims.md": "claims.md", "lab/appendix.md": "appendix.md"}
@@ -100,6 +101,7 @@ def page(name: str, figures: dict[str, bytes]) -> str:
         "figure": lambda sweep, name: named_figure(sweep, name, figures),
         "learning": lambda sweep: learning_figure(sweep, figures),
         "totals": totals_table,
+        "arms": arms_table,
         "runs": runs_table,
         "provenance": lambda sweep: [provenance(sweep)],
         "success": lambda sweep, *stages: success(sweep, figures, stages),

@@ -7,14 +7,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from docs.result_pages.words import percent, row, rule
+from docs.result_pages.exports import is_complete, progress_text
+from docs.result_pages.words import percent, rate_cells, row, rule, spread
 from music_rllib import names
+from music_rllib.results.analysis import analyse_stage
 from music_rllib.results.analysis_plan import MARGIN_OF_A_RATE
-from music_rllib.results.answer import numbers_in_words
+from music_rllib.results.answer import numbers_in_words, verdict_in_words
 from music_rllib.results.claims import Claim, contrast, exploratory
 from music_rllib.results.conditions import Condition, find_stages
 from music_rllib.results.data import Sweep, with_pretraining
 from music_rllib.results.scores import Measure, area_under_curve
+from music_rllib.results.study import study_of
 
 
 @dataclass(frozen=True)
@@ -92,3 +95,34 @@ def totals_table(sweep: Sweep, first: str, second: str) -> Iterator[str]:
                     yield row(
                         task, q, f"{found.total:,.0f}", numbers_in_words(found.claim), ends, seeds
                     )
+
+
+def arms_table(sweep: Sweep) -> Iterator[str]:
+    """One row per stage of a plan that compares stages with one of them; the progress until then.
+
+    Times are those of the runs themselves, without the pretraining that several runs share.
+    """
+    study = study_of(sweep)
+    if study.stage is None or not is_complete(sweep):
+        yield f"**{progress_text(sweep.name).capitalize()}.**"
+        return
+    claims = {claim.hypothesis.first["stage"]: claim for claim in study.planned if claim.hypothesis}
+    finals = {
+        final.condition: final
+        for scope in analyse_stage(sweep, study.stage).scopes
+        for final in scope.finals
+    }
+    yield row(
+        "arm", "verdict, difference", "area over all steps [95% CI]", "success at the end",
+        "minutes a run", "seeds",
+    )  # fmt: skip
+    yield rule(6)
+    for mean in study.means:
+        name = dict(mean.condition.others)["stage"]
+        claim = claims.get(name)
+        against = f"**{verdict_in_words(claim)}**, {numbers_in_words(claim)}" if claim else ""
+        minutes = np.mean([sweep.runs[run].seconds or 0.0 for run in mean.condition.runs]) / 60
+        yield row(
+            name, against, spread(mean.estimate), rate_cells(finals[mean.condition])[0],
+            f"{minutes:.1f}", len(mean.scores.by_seed),
+        )  # fmt: skip
