@@ -250,7 +250,7 @@ async def _look(newcomer: Newcomer, server: str, link: str, program: Path, folde
 # --- a finer sweep -----------------------------------------------------------------------------
 
 
-def test_a_finer_sweep_reuses_what_is_finished(
+def test_a_finer_sweep_reuses_finished_runs(
     newcomer: Newcomer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, file = newcomer.folder, newcomer.folder / "my_sweep.yaml"

@@ -31,7 +31,7 @@ pytestmark = pytest.mark.integration
 
 @pytest.mark.usefixtures("local_ray")
 @pytest.mark.parametrize("variant", ["music-u", "tac"])
-def test_a_longer_run_goes_on_and_ends_with_the_numbers_of_an_unbroken_one(
+def test_a_longer_run_resumes_and_ends_with_the_numbers_of_an_uninterrupted_one(
     tmp_path: Path, variant: Variant
 ) -> None:
     unbroken = job(tmp_path / "a", settings(variant, env_steps=1000))
@@ -132,7 +132,7 @@ LINEAR: dict[str, Any] = {"schedule": "linear", "start": 2.0, "end": 1.0}
         ({}, []),
     ],
 )
-def test_what_spans_the_budget_is_named(changes: dict[str, Any], spans: list[str]) -> None:
+def test_settings_that_span_the_budget_are_named(changes: dict[str, Any], spans: list[str]) -> None:
     run = settings("tac", env_steps=400)
     run = RunSettings.model_validate(run.model_dump() | {"tac": run.tac.model_dump() | changes})
     assert budget_settings(run) == spans
@@ -143,7 +143,7 @@ def test_what_spans_the_budget_is_named(changes: dict[str, Any], spans: list[str
     ("env_steps", "interval", "even"),
     [(600, 200, True), (500, 200, False), (3000, 1500, True), (1500, 1500, False)],
 )
-def test_an_end_that_only_the_budget_asks_for_is_none_to_go_on_from(
+def test_an_end_that_only_the_budget_requires_is_not_resumed(
     env_steps: int, interval: int, even: bool
 ) -> None:
     """A longer run has no evaluation, or no report, at the end of this run's budget."""

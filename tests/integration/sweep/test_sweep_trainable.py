@@ -224,7 +224,7 @@ def test_a_task_sets_the_distance_that_counts_as_moved() -> None:
 
 @pytest.mark.usefixtures("local_ray")
 @pytest.mark.parametrize("variant", ["music-u", "tac"])
-def test_a_cut_run_ends_with_the_numbers_of_an_unbroken_one(
+def test_a_resumed_run_ends_with_the_numbers_of_an_uninterrupted_one(
     tmp_path: Path, variant: Variant
 ) -> None:
     """Also if q depends on the entropy, and the weight of MUSIC's reward on the success rate."""

@@ -76,7 +76,7 @@ def check(code: int, message: str, status: int) -> None:
     assert "planted" not in message
 
 
-def test_a_sweep_says_so_and_starts_nothing(
+def test_a_sweep_prints_the_error_and_starts_nothing(
     uri: str,
     status: int,
     tmp_path: Path,
@@ -94,7 +94,9 @@ def test_a_sweep_says_so_and_starts_nothing(
     assert not any(b"planted" in path.read_bytes() for path in kept)
 
 
-def test_a_report_that_is_to_be_attached_says_so(uri: str, status: int, tmp_path: Path) -> None:
+def test_a_report_that_cannot_be_attached_prints_an_error(
+    uri: str, status: int, tmp_path: Path
+) -> None:
     from music_rllib.program import app
 
     folder = kept_sweep(tmp_path, uri)

@@ -38,7 +38,7 @@ def transition_bounds(
     return estimator.transition_bounds(frames[:, 0], frames[:, 1], (swapped,))
 
 
-def test_bound_approaches_what_the_cap_allows_and_never_exceeds_the_truth() -> None:
+def test_the_bound_approaches_the_limit_of_the_cap_and_never_exceeds_the_truth() -> None:
     truth = true_information(0.9, 1)
     bound = trained_bound(0.9, 1, seed=0, steps=200)
     # 0.01: the sampling error of 160,000 held-out pairs, three standard deviations.

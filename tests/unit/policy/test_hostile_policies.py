@@ -152,7 +152,7 @@ def test_a_checkpoint_s_other_files_are_not_even_looked_at(tmp_path: Path, kind:
         storage.read("node", "state.safetensors")
 
 
-def test_what_a_manifest_declares_is_the_limit(tmp_path: Path) -> None:
+def test_the_size_in_a_manifest_is_the_limit(tmp_path: Path) -> None:
     node = seal_policy(tmp_path, PENDULUM)
     weights = node / "handoff" / "policy.safetensors"
     with weights.open("ab") as file:

@@ -117,7 +117,7 @@ def test_saving_a_loaded_replay_gives_the_same_bytes(
         np.testing.assert_array_equal(getattr(ours, field), getattr(theirs, field))
 
 
-def test_a_checkpoint_writes_only_what_is_new(disk: Disk) -> None:
+def test_a_checkpoint_writes_only_new_data(disk: Disk) -> None:
     layout = ReplayLayout(observation=25, action=4, goal=3, horizon=50)
     replay = TrajectoryReplay(layout, 225_000, np.random.default_rng(0))
     whole = Trajectory(

@@ -927,7 +927,7 @@ def test_a_damaged_run_is_named_by_every_command_and_trained_again_when_asked(
     assert program("status", place).code == 0
 
 
-def test_what_a_search_has_asked_for_before_is_verified_too(tmp_path: Path) -> None:
+def test_earlier_trials_of_a_search_are_verified_too(tmp_path: Path) -> None:
     """Its trials are not part of the plan before the search starts."""
     search = {"space": {"tac.lr": {"float": [1e-4, 1e-2]}}, "trials": 4}
     stages = [{"name": "train", "variant": "tac", "search": search}]
