@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from music_rllib import names
+from music_rllib.experiment.plan import short
 from music_rllib.results import statistics as st
 from music_rllib.results.analysis import StageAnalysis
 from music_rllib.results.answer import (
@@ -398,7 +399,9 @@ def search_tables(search: Entry) -> Iterator[Table]:
 
 
 def _setting(value: object) -> str:
-    return DASH if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
+    if value is None:
+        return DASH
+    return f"{value:.4g}" if isinstance(value, float) else short(value, "")
 
 
 def _objectives(row: Entry, field: str, count: int) -> Iterator[Estimate | None]:
