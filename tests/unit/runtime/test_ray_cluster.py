@@ -88,8 +88,8 @@ def test_folders_of_killed_processes_are_removed_at_the_next_start(tmp_path: Pat
     assert (elsewhere / "file").exists()
 
 
-NEVER = 4_194_304
-"""One more than Linux's largest id of a process."""
+NEVER, ALWAYS = 4_194_304, 1
+"""An id that no process has, one more than Linux's largest, and the id of the first process."""
 
 
 @pytest.mark.parametrize(
@@ -97,7 +97,7 @@ NEVER = 4_194_304
     [
         ("logs/x", NEVER, 7, True),
         ("logs/x", NEVER, 5, False),
-        ("logs/x", os.getpid(), 7, False),
+        ("logs/x", ALWAYS, 7, False),
         ("../../notes", NEVER, 7, False),
         ("../notes", NEVER, 7, False),
     ],
