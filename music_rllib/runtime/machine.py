@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import fcntl
 import math
@@ -108,11 +109,22 @@ def own_folder(prefix: str, parent: Path | None = None) -> Iterator[str]:
     parent = Path(tempfile.gettempdir()) if parent is None else parent
     for folder in parent.glob(f"{prefix}*"):
         _remove_if_left(folder)
-    made = tempfile.TemporaryDirectory(prefix=prefix, dir=parent, ignore_cleanup_errors=True)
-    with made as name, Path(name, "new").open("w") as lock:
+    name = tempfile.mkdtemp(prefix=prefix, dir=parent)
+    # Neither a file object nor a TemporaryDirectory: both warn if their owner is never closed.
+    lock = os.open(Path(name, "new"), os.O_CREAT | os.O_WRONLY, 0o600)
+
+    def end() -> None:
+        shutil.rmtree(name, ignore_errors=True)
+        os.close(lock)
+
+    atexit.register(end)
+    try:
         fcntl.flock(lock, fcntl.LOCK_EX)  # until this process ends
-        Path(lock.name).rename(Path(name, LOCK))
+        Path(name, "new").rename(Path(name, LOCK))
         yield name
+    finally:
+        atexit.unregister(end)
+        end()
 
 
 def _remove_if_left(folder: Path) -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -115,6 +118,18 @@ def test_a_folder_that_a_dying_ray_makes_again_is_removed_hours_later(
         os.utime(path, (then, then), follow_symlinks=False)
     with own_folder("mr-", tmp_path):
         assert folder.exists() != removed
+
+
+def test_a_folder_is_removed_without_a_warning_if_its_owner_is_collected(tmp_path: Path) -> None:
+    owner: list[Any] = [contextlib.ExitStack()]
+    owner[0].enter_context(own_folder("mr-", tmp_path))
+    owner.append(owner)
+    assert [*tmp_path.iterdir()]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        del owner
+        gc.collect()
+    assert (caught, [*tmp_path.iterdir()]) == ([], [])
 
 
 @pytest.mark.parametrize(
