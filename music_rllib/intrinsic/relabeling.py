@@ -45,7 +45,7 @@ def reward_class(name: str) -> type[IntrinsicReward]:
     return found
 
 
-def check_reward(settings: IntrinsicSettings) -> type[IntrinsicReward]:
+def checked_class(settings: IntrinsicSettings) -> type[IntrinsicReward]:
     """The class of a reward whose settings fit its constructor.
 
     Raises:
@@ -66,7 +66,7 @@ def make_reward(settings: IntrinsicSettings, sizes: Sizes, seed: int) -> Intrins
     Raises:
         ValueError: The class, its settings or the environment do not fit.
     """
-    kind = check_reward(settings)
+    kind = checked_class(settings)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return kind(sizes, **settings.settings)

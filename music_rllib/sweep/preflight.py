@@ -99,10 +99,10 @@ def fingerprints(plan: Plan) -> dict[str, Fingerprint]:
         run.intrinsic.identity: run.intrinsic for run in plan.settings if run.own_modules
     }
     for settings in own_rewards.values():
-        from music_rllib.intrinsic.relabeling import check_reward
+        from music_rllib.intrinsic.relabeling import checked_class
 
         try:
-            check_reward(settings)
+            checked_class(settings)
         except ValueError as error:
             raise TaskError(str(error)) from error
     return found
