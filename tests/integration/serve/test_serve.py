@@ -122,7 +122,9 @@ def test_a_storm_is_answered_or_asked_to_come_again(service: Service) -> None:
             client.settimeout(60)
             # 503 if too many others waited when it arrived.
             assert client.recv(65536).startswith((b"HTTP/1.1 408 ", b"HTTP/1.1 503 "))
-    assert seen.count(200, 408, 503) == 600  # 408 if this machine takes longer than 10 s
+    # 408 if this machine takes longer than 10 s; the seconds of others tell where they come from.
+    assert [answer for answer in seen.answers if answer[0] not in (200, 408, 503)] == []
+    assert len(seen.answers) == 600
     assert seen.count(200) >= 32
     assert (seen.count(503) > 0, seen.without_retry) == (True, 0)
     assert {status for status, _ in seen.healths} == {200}
