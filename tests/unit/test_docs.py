@@ -108,6 +108,7 @@ def test_every_page_is_on_the_documentation_site() -> None:
         *("q_entropy_factorial", "claims_push", "claims_pick_and_place", "claims_slide"),
         "joint_push",
         "joint_her",
+        "joint_music",
     ],
 )
 def test_the_claims_and_their_sweeps_have_the_same_plan(study: str) -> None:
