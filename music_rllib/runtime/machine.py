@@ -112,19 +112,17 @@ def own_folder(prefix: str, parent: Path | None = None) -> Iterator[str]:
     name = tempfile.mkdtemp(prefix=prefix, dir=parent)
     # Neither a file object nor a TemporaryDirectory: both warn if their owner is never closed.
     lock = os.open(Path(name, "new"), os.O_CREAT | os.O_WRONLY, 0o600)
-
-    def end() -> None:
-        shutil.rmtree(name, ignore_errors=True)
-        os.close(lock)
-
-    atexit.register(end)
+    cleanup = contextlib.ExitStack()  # its second `close` does nothing
+    cleanup.callback(os.close, lock)
+    cleanup.callback(shutil.rmtree, name, ignore_errors=True)
+    atexit.register(cleanup.close)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX)  # until this process ends
         Path(name, "new").rename(Path(name, LOCK))
         yield name
     finally:
-        atexit.unregister(end)
-        end()
+        atexit.unregister(cleanup.close)
+        cleanup.close()
 
 
 def _remove_if_left(folder: Path) -> None:

@@ -132,6 +132,24 @@ def test_a_folder_is_removed_without_a_warning_if_its_owner_is_collected(tmp_pat
     assert (caught, [*tmp_path.iterdir()]) == ([], [])
 
 
+NEVER_CLOSED = """
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from music_rllib.runtime.machine import own_folder
+owner = ExitStack()
+owner.enter_context(own_folder("mr-", Path(sys.argv[1])))
+owner.itself = owner
+"""
+
+
+def test_a_folder_is_removed_silently_if_its_owner_is_never_closed(tmp_path: Path) -> None:
+    """The process ends, and Python finalizes the owner after that."""
+    command = [sys.executable, "-c", NEVER_CLOSED, tmp_path]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr, [*tmp_path.iterdir()]) == (0, "", [])
+
+
 @pytest.mark.parametrize(
     ("settings", "nodes", "expected"),
     [
