@@ -10,7 +10,6 @@ T atoms of a target (1: its mean).
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -32,7 +31,7 @@ def critic_target(
 
 @compiled
 def critic_loss(
-    outputs: Array, target: Array, weights: Array, fractions: Any, gradient: Array
+    outputs: Array, target: Array, weights: Array, fractions: Array, gradient: Array
 ) -> float:
     """The loss of critics, summed over them, and its derivative.
 
@@ -40,11 +39,10 @@ def critic_loss(
         outputs: [C, B, M] critics at the batch's actions.
         target: [B, T]
         weights: [B] importance weights, or empty for 1.
-        fractions: None: `_squared_loss`; [M] fractions of quantiles: `_quantile_loss`. The
-            compiler drops the other one.
+        fractions: [M] of quantiles, for `_quantile_loss`; empty: `_squared_loss`.
         gradient: [C, B, M] receives the derivative.
     """
-    if fractions is None:
+    if len(fractions) == 0:
         loss: float = _squared_loss(outputs, target, weights, gradient)
     else:
         loss = _quantile_loss(outputs, target, weights, fractions, gradient)
@@ -97,9 +95,9 @@ def _quantile_huber(quantile: float, target: Array, fraction: float) -> tuple[fl
 
 
 @compiled
-def target_atoms(outputs: Array, fractions: Any, dropped: int) -> Array:
+def target_atoms(outputs: Array, fractions: Array, dropped: int) -> Array:
     """[C, B, M] -> [B, T] the value of the smallest critic, or the smallest quantiles of all."""
-    if fractions is None:
+    if len(fractions) == 0:
         atoms: Array = smallest_critic(outputs[:, :, 0], np.arange(len(outputs))).reshape((-1, 1))
     else:
         atoms = smallest_atoms(outputs, dropped)

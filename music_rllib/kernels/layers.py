@@ -38,9 +38,8 @@ class Normalized(NamedTuple):
 class Network(NamedTuple):
     """A perceptron with ReLU between its layers and a linear output.
 
-    Networks with and without layer normalization have different types, so that neither's machine
-    code contains the other's. C networks of equal shape are one `Network` whose positions and kept
-    outputs have a leading axis C; `member` takes one of them.
+    C networks of equal shape are one `Network` whose positions and kept outputs have a leading axis
+    C; `member` takes one of them.
     """
 
     values: Array
@@ -57,8 +56,8 @@ class Network(NamedTuple):
     """Whether weights are [O, I], as in `torch.nn.Linear`; otherwise [I, O]."""
     kept: Array
     """Outputs of all layers in the last forward pass."""
-    normalized: Normalized | None
-    """None: hidden layers have no layer normalization."""
+    normalized: Normalized
+    """Empty if hidden layers have no layer normalization."""
 
 
 # -- layers ---------------------------------------------------------------------------------
@@ -158,7 +157,7 @@ def member(networks: Network, c: int) -> Network:
     return Network(
         networks.values, networks.gradients, networks.sizes, networks.weights[c],
         networks.biases[c], networks.by_outputs, networks.kept[at],
-        _of_member(networks.normalized, at),
+        Normalized(networks.normalized.outputs[at], networks.normalized.inverse_std[at]),
     )  # fmt: skip
 
 
@@ -195,32 +194,20 @@ def _outputs_in(flat: Array, sizes: Array, layer: int, rows: int) -> Array:
     return outputs
 
 
-# The following functions get None for a network without layer normalization. The compiler then
-# drops their other branch.
+@compiled
+def _of_layer(network: Network, layer: int, rows: int) -> Normalized:
+    """`Normalized` of one hidden layer; without rows if there is no layer normalization."""
+    outputs, inverse_std = network.normalized
+    rows = rows if len(inverse_std) > 0 else 0
+    some = inverse_std[layer * rows : (layer + 1) * rows]
+    return Normalized(_outputs_in(outputs, network.sizes, layer, rows), some)
 
 
 @compiled
-def _of_member(normalized: Any, at: int) -> Any:
-    """`Normalized` of one network of several."""
-    if normalized is None:
-        return None
-    return Normalized(normalized.outputs[at], normalized.inverse_std[at])
-
-
-@compiled
-def _of_layer(normalized: Any, sizes: Array, layer: int, rows: int) -> Any:
-    """`Normalized` of one hidden layer."""
-    if normalized is None:
-        return None
-    inverse_std = normalized.inverse_std[layer * rows : (layer + 1) * rows]
-    return Normalized(_outputs_in(normalized.outputs, sizes, layer, rows), inverse_std)
-
-
-@compiled
-def _hidden(out: Array, bias: Array, normalized: Any) -> None:
+def _hidden(out: Array, bias: Array, normalized: Normalized) -> None:
     """Bias, layer normalization and ReLU of [R, O]."""
     for r in range(len(out)):
-        if normalized is None:
+        if len(normalized.inverse_std) == 0:
             add_bias_relu(out[r], bias)
         else:
             add_bias(out[r], bias)
@@ -229,13 +216,13 @@ def _hidden(out: Array, bias: Array, normalized: Any) -> None:
 
 @compiled
 def _hidden_backward(
-    gradient: Array, outputs: Array, normalized: Any, rows: Rows, learned: int, bias: Array
+    gradient: Array, outputs: Array, normalized: Normalized, rows: Rows, learned: int, bias: Array
 ) -> None:
     """Derivative of `_hidden` at some rows; the bias receives that of the first ones."""
     bias[:] = 0
     for r in range(len(rows)):
         relu_backward(gradient[r], outputs[rows[r]])
-        if normalized is not None:
+        if len(normalized.inverse_std) > 0:
             kept, factor = normalized.outputs[rows[r]], normalized.inverse_std[rows[r]]
             layer_norm_backward(gradient[r], kept, factor)
         if r < learned:
@@ -253,8 +240,7 @@ def forward(network: Network, inputs: Array) -> Array:
         weights = layer_weights(network, network.values, layer)
         linear(inputs, weights, network.by_outputs, out)
         if layer < last:
-            normalized = _of_layer(network.normalized, network.sizes, layer, rows)
-            _hidden(out, bias, normalized)
+            _hidden(out, bias, _of_layer(network, layer, rows))
         else:
             for r in range(rows):
                 add_bias(out[r], bias)
@@ -294,7 +280,7 @@ def backward(
         size = network.sizes[layer]
         out = scratch[layer % 2, : len(rows) * size].reshape((len(rows), size))
         linear_backward_inputs(gradient, weights, network.by_outputs, out)
-        normalized = _of_layer(network.normalized, network.sizes, layer - 1, len(inputs))
+        normalized = _of_layer(network, layer - 1, len(inputs))
         bias = _bias(network, network.gradients, layer - 1)
         _hidden_backward(out, below, normalized, rows, learned, bias)
         gradient = out

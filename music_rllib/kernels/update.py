@@ -69,9 +69,8 @@ class UpdateSettings(NamedTuple):
     """Number of critics whose mean the policy improves on, the first ones; 0: the smallest one."""
     has_value: bool
     """Whether a value network evaluates next states; otherwise averaged critics do."""
-    fractions: Array | None
-    """[M] fractions of the critics' quantiles; None: critics are means. Like layer normalization,
-    it selects the code that is compiled."""
+    fractions: Array
+    """[M] fractions of the critics' quantiles; empty: critics are means."""
     dropped_quantiles: int
     """Number of each critic's quantiles that targets leave out, the largest ones."""
     policy_delay: int

@@ -203,7 +203,7 @@ def _settings_of(module: TACModule) -> UpdateSettings:
         joint=settings.entropy_form == "joint",
         averaged_critics={"min": 0, "first": 1, "mean": count}[settings.policy_critic],
         has_value=settings.bootstrap == "value",
-        fractions=None if fractions is None else fractions.to(mean).numpy(),
+        fractions=mean.numpy()[:0] if fractions is None else fractions.to(mean).numpy(),
         dropped_quantiles=settings.dropped_quantiles,
         policy_delay=settings.policy_delay,
     )
@@ -242,7 +242,7 @@ def _network(
     def room(numbers: int) -> Array:
         return flat.values.new_empty(*kept, rows * numbers).numpy()
 
-    hidden = sizes[1:-1]
+    normalized = sizes[1:-1] if layer_norm else []
     return Network(
         values=flat.values.numpy(),
         gradients=flat.gradients.numpy(),
@@ -251,5 +251,5 @@ def _network(
         biases=np.array(biases),
         by_outputs=by_outputs,
         kept=room(sum(sizes[1:])),
-        normalized=Normalized(room(sum(hidden)), room(len(hidden))) if layer_norm else None,
+        normalized=Normalized(room(sum(normalized)), room(len(normalized))),
     )
