@@ -83,6 +83,10 @@ class AnalysisPlan(_Strict):
         return _stages_of(self.hypotheses, self.stage)
 
     @property
+    def stages_of_hypotheses(self) -> dict[str, frozenset[str]]:
+        return {text: _stages_of([text], self.stage) for text in self.hypotheses}
+
+    @property
     def seed_count(self) -> int:
         """Number of seeds of each condition; 0 if stages have different seeds."""
         fresh = re.match(r"(\d+) fresh ones; [^;:]*$", self.seeds)

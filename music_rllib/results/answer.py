@@ -74,6 +74,8 @@ def planned_in_words(study: Study) -> str:
             f"planned {plan.recorded}, before its first run finished; version {plan.version}, "
             f"hash {plan.hash[:12]}"
         )
+        if study.late:
+            text += f"; not planned, because runs of it had finished: {', '.join(study.late)}"
         changed = [] if latest is None else _changed(plan.plan, latest.plan)
         return f"{text}; changed afterwards: {', '.join(changed)}" if changed else text
     if latest is not None:

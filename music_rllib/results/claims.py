@@ -350,7 +350,8 @@ def decided(claims: Sequence[Claim], *, planned: bool, without_test: int = 0) ->
 
 def exploratory(claims: Sequence[Claim]) -> tuple[Claim, ...]:
     """Claims outside the plan: without a verdict and without an adjusted p-value."""
-    return tuple(replace(claim, why="exploratory: not in the plan") for claim in claims)
+    why = "exploratory: not in the plan"
+    return tuple(replace(claim, why=claim.why or why) for claim in claims)
 
 
 def _decided(claim: Claim) -> Claim:

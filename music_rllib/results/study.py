@@ -57,13 +57,16 @@ class Study:
     stage: StageRuns | None
     """None before a run has started, and without a stage that trains for the task."""
     plan: PlanVersion | None
-    """The last version recorded before the first of its runs had finished; None without one."""
+    """The last version recorded before the first run of its hypotheses, or of some of them, had
+    finished; None without one."""
     latest: PlanVersion | None
     means: tuple[Mean, ...]
     planned: tuple[Claim, ...]
-    """Claims of the hypotheses of `plan`."""
+    """Claims of the hypotheses of `plan`, without the `late` ones."""
     unplanned: tuple[Claim, ...]
-    """Other claims: hypotheses that are only in `latest`, and other pairs of the stage."""
+    """Other claims: late hypotheses, those that are only in `latest`, other pairs of the stage."""
+    late: tuple[str, ...]
+    """Hypotheses of `plan` about stages with a run that had finished before."""
     untested: tuple[str, ...]
     """Hypotheses that can't be tested, with the reason."""
     runs: tuple[int, ...]
@@ -102,7 +105,7 @@ def study_of(
     """
     stages = {found.name: found for found in find_stages(sweep)}
     latest = sweep.plans[-1] if sweep.plans else None
-    plan = _plan_before_results(sweep, stages)
+    plan, late = _plan_before_results(sweep, stages)
     chosen = stages.get(stage or (latest.plan.stage if latest else ""))
     if chosen is None and stage is None:
         chosen = next((s for s in reversed(stages.values()) if s.has_task_reward), None)
@@ -111,9 +114,14 @@ def study_of(
         of_hypotheses = [found for name, found in stages.items() if name in latest.plan.stages]
         chosen = stages_together(of_hypotheses) or chosen
     untested: list[str] = []
-    planned = list(_of_plan(sweep, stages, plan, (), untested)) if plan else []
+    planned = list(_of_plan(sweep, stages, plan, late, untested)) if plan else []
     without_test = len(untested)
     unplanned: list[Claim] = []
+    if plan is not None and late:
+        in_time = [text for text in plan.plan.hypotheses if text not in late]
+        why = "exploratory: runs of it had finished before the plan"
+        others = _of_plan(sweep, stages, plan, in_time, untested)
+        unplanned += [replace(claim, why=why) for claim in others]
     if latest is not None and latest != plan:
         tests = {(one.plan.metric, one.plan.margin) for one in (plan, latest) if one}
         known = plan.plan.hypotheses if plan and len(tests) == 1 else ()
@@ -140,6 +148,7 @@ def study_of(
         plan=plan,
         latest=latest,
         means=tuple(means),
+        late=late,
         planned=decided(planned, planned=True, without_test=without_test),
         unplanned=exploratory(unplanned) if plan else decided(unplanned, planned=False),
         untested=tuple(dict.fromkeys(untested)),
@@ -158,13 +167,26 @@ def _runs(stage: StageRuns) -> list[int]:
     return [run for condition in stage.compared for run in condition.runs]
 
 
-def _plan_before_results(sweep: Sweep, stages: Mapping[str, StageRuns]) -> PlanVersion | None:
-    """The last version of the plan that was recorded before any result of its stages."""
+def _plan_before_results(
+    sweep: Sweep, stages: Mapping[str, StageRuns]
+) -> tuple[PlanVersion | None, tuple[str, ...]]:
+    """The last version of the plan that was recorded before results, and its late hypotheses.
+
+    A hypothesis is late if a run of its stages had finished, as one that an earlier sweep trained.
+    A version without late hypotheses comes before a later one with some.
+    """
+    found: tuple[PlanVersion | None, tuple[str, ...]] = (None, ())
     for version in reversed(sweep.plans):
-        runs = [run for name in version.plan.stages & stages.keys() for run in stages[name].runs]
-        if version.recorded_ms < first_result(sweep, runs):
-            return version
-    return None
+        first = {
+            text: first_result(sweep, (r for name in of & stages.keys() for r in stages[name].runs))
+            for text, of in version.plan.stages_of_hypotheses.items()
+        }
+        late = tuple(text for text, time in first.items() if version.recorded_ms >= time)
+        if not late:
+            return version, ()
+        if found[0] is None and len(late) < len(first):
+            found = version, late
+    return found
 
 
 def _of_plan(

@@ -176,6 +176,42 @@ def test_a_plan_recorded_after_a_result_does_not_count(rng: np.random.Generator)
     assert study_of(sweep_of(begun, late)).plan is not None
 
 
+def test_a_hypothesis_about_finished_runs_is_not_planned_but_the_others_are(
+    rng: np.random.Generator,
+) -> None:
+    """A plan may compare new runs with those of an earlier study."""
+    known = study({"1": 0.2}, 8, rng)
+    new = [
+        run({"tac.entropic_index": q}, seed, height, rng, stage="finetune")
+        for q, height in (("1", 0.3), ("1.5", 0.4))
+        for seed in range(8)
+    ]
+    times = [DONE + 5] * len(new[0][1].times)
+    later = [(record, points._replace(times=times)) for record, points in new]
+    between_q, between_stages = (
+        "q = 1.5 better than q = 1",
+        "stage = finetune, q = 1 better than stage = train, q = 1",
+    )
+    plans = with_plan((), plan(between_q, between_stages, stage="finetune"), DONE + 1)
+    sweep = sweep_of([*known, *later], plans)
+    found = study_of(sweep)
+    assert [(one.hypothesis.text, one.verdict) for one in found.planned if one.hypothesis] == [
+        (between_q, Verdict.SUPERIOR)
+    ]
+    alone = study_of(sweep_of(later, with_plan((), plan(between_q, stage="finetune"), DONE + 1)))
+    assert found.planned[0].p_value == alone.planned[0].p_value
+    (other,) = found.unplanned
+    assert other.hypothesis is not None
+    assert (other.hypothesis.text, other.verdict, other.why) == (
+        between_stages,
+        Verdict.NONE,
+        "exploratory: runs of it had finished before the plan",
+    )
+    said = answer(sweep, found)[0]
+    assert "before its first run finished" in said
+    assert "not planned, because runs of it had finished: stage = finetune, q = 1 better" in said
+
+
 def test_a_plan_that_changes_after_a_result_keeps_its_planned_claims(
     rng: np.random.Generator,
 ) -> None:
