@@ -283,11 +283,11 @@ def plans_in(storage: str, name: str) -> tuple[PlanVersion, ...]:
         ) from error
 
 
-def record_plan(sweep: OpenSweep) -> Sequence[PlanVersion]:
+def record_plan(sweep: OpenSweep) -> tuple[Sequence[PlanVersion], tuple[str, ...]]:
     """Record the plan of a sweep's configuration as a new version if it changed.
 
     Returns:
-        All versions.
+        All versions; and the hypotheses of a new one about stages with a finished run.
 
     Raises:
         StorageError: The plan can't be written, or earlier versions can't be read.
@@ -295,9 +295,11 @@ def record_plan(sweep: OpenSweep) -> Sequence[PlanVersion]:
     before = plans_in(sweep.storage, sweep.config.name)
     plan = analysis_plan(sweep.config)
     if plan is None:
-        return before
+        return before, ()
     versions = with_plan(before, plan, int(time.time() * 1000))
-    if len(versions) > len(before):
-        sweep.location.keep(ANALYSIS_PLAN, as_json(as_document(versions)))
-        sweep.location.keep(PLANS_TO_READ, as_markdown(sweep.config.name, versions))
-    return versions
+    if len(versions) == len(before):
+        return versions, ()
+    sweep.location.keep(ANALYSIS_PLAN, as_json(as_document(versions)))
+    sweep.location.keep(PLANS_TO_READ, as_markdown(sweep.config.name, versions))
+    done = {node.stage for node in sweep.plan.nodes if node.key in sweep.finished}
+    return versions, tuple(text for text, of in plan.stages_of_hypotheses.items() if of & done)

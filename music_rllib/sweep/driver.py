@@ -242,12 +242,14 @@ def _record_analysis_plan(console: Console, opened: OpenSweep) -> list[dict[str,
         return []
     from music_rllib.results.analysis_plan import PLANS_TO_READ, as_document, record_plan
 
-    versions = record_plan(opened)
+    versions, late = record_plan(opened)
     if versions:
         last = versions[-1]
         place = redact(f"{opened.storage}/{opened.config.name}/{PLANS_TO_READ}")
         recorded = f"version {last.version} recorded {last.recorded}, hash {last.hash[:12]}"
         _say(console, f"Analysis plan: {place}, {recorded}")
+    if late:
+        _say(console, f"Not planned, because runs of it have finished: {'; '.join(late)}", "yellow")
     return as_document(versions)
 
 

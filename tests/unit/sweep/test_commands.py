@@ -843,6 +843,18 @@ def test_an_analysis_plan_is_recorded_and_changes_no_run(
     assert (refused.code, "as they were recorded" in refused.errors) == (2, True)
 
 
+def test_plan_names_hypotheses_about_finished_runs_when_it_records_them(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    played(storage, tmp_path, runs=1)
+    planned = tmp_path / "planned.yaml"
+    analysis = {"hypotheses": ["q = 1.5 better than q = 1"]}
+    planned.write_text(yaml.safe_dump({**SWEEP, "storage": storage, "analysis": analysis}))
+    message = "Not planned, because runs of it have finished: q = 1.5 better than q = 1"
+    assert message in in_one_line(program("plan", str(planned)).output)
+    assert "Not planned" not in program("plan", str(planned)).output  # recorded before
+
+
 def test_plan_as_json_with_more_seeds(
     tmp_path: Path, program: Program, monkeypatch: pytest.MonkeyPatch
 ) -> None:
