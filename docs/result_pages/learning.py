@@ -10,16 +10,17 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from docs.result_pages.figures import figure
-from docs.result_pages.summary import STUDIES, complete_studies
+from docs.result_pages.summary import STUDIES, compared, complete_studies
 from music_rllib import names
 from music_rllib.report.figures.choice import Drawing
 from music_rllib.report.figures.draw import files
 from music_rllib.report.figures.plots import METRICS, Style, Subplot, curve_subplot, styles_of
 from music_rllib.results import statistics as st
 from music_rllib.results.analysis import Curve, curve
-from music_rllib.results.conditions import Condition, StageRuns, find_stages
+from music_rllib.results.conditions import Condition, find_stages
 from music_rllib.results.data import Sweep, with_pretraining
 from music_rllib.results.statistics import Array
+from music_rllib.results.study import study_of
 
 PRETRAINING = ("MUSIC-u (pretraining, no reward)", Style("#9a9a9a", "o"))
 SCRATCH = ("HER alone, q = 1", Style("#4d4d4d", "D", (6, 3)))
@@ -54,27 +55,31 @@ def overview() -> bytes:
         legend = _legend(sweep)
         first = study.planned[0]
         curves = [_shifted(sweep, curve(sweep, c, first.task, SUCCESS.name)) for c in legend]
-        title = f"{first.task}, {first.contrast.seeds[0]} seeds\n{STUDIES[sweep.name]}"
+        setting = STUDIES[sweep.name].replace(", ", "\n")
+        title = f"{first.task}, {first.contrast.seeds[0]} seeds\n{setting}"
         subplots.append(_subplot(title, curves, legend))
         entries |= dict(legend.values())
     return files(subplots, list(entries.items()))[".png"]
 
 
 def _legend(sweep: Sweep) -> dict[Condition, tuple[str, Style]]:
-    """Label and style of each condition; conditions compared by q have the color of their q."""
+    """Label and style of the conditions that the plan compares, and of the pretraining.
+
+    Conditions compared by q have the color of their q.
+    """
+    pairs = [pair for claim in compared(study_of(sweep)) for pair in claim.pairs]
+    planned = [condition for pair in pairs for condition in pair]
     legend: dict[Condition, tuple[str, Style]] = {}
     for stage in find_stages(sweep):
-        for condition, style in styles_of(stage.conditions).items():
-            legend[condition] = _entry(stage, condition, style)
+        if not stage.has_task_reward:
+            legend |= dict.fromkeys(stage.conditions, PRETRAINING)
+            continue
+        shown = tuple(condition for condition in stage.conditions if condition in planned)
+        from_scratch = stage.variant == "tac" and len(shown) == 1
+        for condition, style in styles_of(shown).items():
+            own = f"q = {condition.entropic_index}", style
+            legend[condition] = SCRATCH if from_scratch else own
     return legend
-
-
-def _entry(stage: StageRuns, condition: Condition, style: Style) -> tuple[str, Style]:
-    if not stage.has_task_reward:
-        return PRETRAINING
-    if stage.variant == "tac" and len({one.entropic_index for one in stage.conditions}) == 1:
-        return SCRATCH
-    return f"q = {condition.entropic_index}", style
 
 
 def _subplot(

@@ -12,12 +12,14 @@ from docs.result_pages.words import percent, row, rule
 from music_rllib import names
 from music_rllib.results.answer import not_excluded, numbers_in_words, verdict_in_words
 from music_rllib.results.claims import Claim, Verdict, claims_of, exploratory
-from music_rllib.results.data import Sweep
+from music_rllib.results.data import Sweep, with_pretraining
+from music_rllib.results.scores import Measure
 from music_rllib.results.study import Study, study_of
 
 JOINT = "joint entropy, HER alone"
 MUSIC = "per-dimension entropy, MUSIC-r"
 STUDIES = {
+    "joint-music": "joint entropy, MUSIC-r",
     "joint-her": JOINT,
     "claims-push": MUSIC,
     "claims-pick-and-place": MUSIC,
@@ -42,12 +44,24 @@ def complete_studies() -> list[tuple[Sweep, Study]]:
     return [(sweep, study_of(sweep)) for sweep in sweeps if sweep and is_complete(sweep)]
 
 
+def compared(study: Study) -> list[Claim]:
+    """The comparisons of the plan, the late ones last."""
+    late = [c for c in study.unplanned if c.hypothesis and c.hypothesis.text in study.late]
+    return [*study.planned, *late]
+
+
 def sampled(sweep: Sweep, study: Study) -> tuple[Claim, ...]:
-    """The planned comparisons by the success of training episodes, whose actions are sampled."""
-    first, *_ = study.planned
-    pairs = [(claim.first, claim.second, claim.pairs) for claim in study.planned]
+    """The plan's comparisons by the success of training episodes, whose actions are sampled."""
+    first, *_ = claims = compared(study)
+    pairs = [(claim.first, claim.second, claim.pairs) for claim in claims]
     measures = {first.task: replace(first.measure, metric=names.TRAIN_SUCCESS)}
+    sweep = counted(sweep, first.measure)
     return exploratory(list(claims_of(sweep, pairs, measures, first.margin)))
+
+
+def counted(sweep: Sweep, measure: Measure) -> Sweep:
+    """The sweep with the environment steps that the measure counts."""
+    return with_pretraining(sweep) if measure.kind == "auc_total" else sweep
 
 
 def between_q(claims: Sequence[Claim]) -> list[Claim]:
@@ -67,14 +81,19 @@ def headline() -> str:
 def _effects(claims: Sequence[Claim]) -> str:
     """The effect of q on each task."""
     tasks = dict.fromkeys(claim.task for claim in claims)
-    better = [pair for c in claims if (pair := winner_and_loser(c)) and pair[0] == "q = 1.5"]
+    decided = list(filter(None, map(winner_and_loser, claims)))
+    better = [pair for pair in decided if pair[0] == "q = 1.5"]
     parts = [f"q = 1.5 needs fewer steps than {loser} on {task}" for _, loser, task in better]
+    worse: dict[tuple[str, str], list[str]] = {}
+    for winner, loser, task in decided:
+        if winner != "q = 1.5":
+            worse.setdefault((loser, task), []).append(winner)
     where = "any task here" if len(tasks) > 1 else next(iter(tasks))
-    parts = parts or [f"q = 1.5 beats neither q = 1 nor q = 2 on {where}"]
+    if not better and not any(loser == "q = 1.5" for loser, _ in worse):
+        parts = [f"q = 1.5 beats neither q = 1 nor q = 2 on {where}"]
     parts += [
-        f"{pair[1]} needs more steps than {pair[0]} on {pair[2]}"
-        for c in claims
-        if (pair := winner_and_loser(c)) and pair not in better
+        f"{loser} needs more steps than {' and '.join(winners)} on {task}"
+        for (loser, task), winners in worse.items()
     ]
     for task in tasks:
         verdicts = {claim.verdict for claim in claims if claim.task == task}
@@ -140,13 +159,15 @@ def summary_table() -> Iterator[str]:
     yield rule(len(columns))
     for sweep, study in complete_studies():
         setting = STUDIES[sweep.name]
-        for claim, other in zip(study.planned, sampled(sweep, study), strict=True):
+        for claim, other in zip(compared(study), sampled(sweep, study), strict=True):
             paper = PAPER.get((claim.task, claim.first, claim.second), "Figure 7: worse")
             if setting == JOINT:
                 paper = paper.replace(":", " (with MUSIC):")
             comparison = f"{claim.first} against {claim.second}"
             if claim.first.startswith(BETWEEN_STAGES):
-                paper, comparison = "", "MUSIC-r, q = 1, against HER alone, pretraining not counted"
+                counted = "" if claim.measure.kind == "auc_total" else "not "
+                paper = ""
+                comparison = f"MUSIC-r, q = 1, against HER alone, pretraining {counted}counted"
             cells = (verdict_cell(claim), verdict_cell(other), claim.contrast.seeds[0])
             yield row(claim.task, setting, comparison, paper, *cells)
         for found in equal_totals(sweep, study):
@@ -157,9 +178,9 @@ def summary_table() -> Iterator[str]:
 
 
 def equal_totals(sweep: Sweep, study: Study) -> Iterator[tuple[AtEqualTotal, AtEqualTotal]]:
-    """Each planned comparison of stages at equal total steps: mean action, sampled policy."""
+    """Planned comparisons of stages, at equal total steps instead: mean action, sampled policy."""
     for claim in study.planned:
-        if claim.first.startswith(BETWEEN_STAGES):
+        if claim.first.startswith(BETWEEN_STAGES) and claim.measure.kind != "auc_total":
             ((first, second),) = claim.pairs
             mean, other = (
                 at_equal_total(sweep, first, second, claim.task, metric)
