@@ -145,7 +145,7 @@ owner.itself = owner
 
 def test_a_folder_is_removed_silently_if_its_owner_is_never_closed(tmp_path: Path) -> None:
     """The process ends, and Python finalizes the owner after that."""
-    command = [sys.executable, "-c", NEVER_CLOSED, tmp_path]
+    command = [sys.executable, "-c", NEVER_CLOSED, str(tmp_path)]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (ended.returncode, ended.stderr, [*tmp_path.iterdir()]) == (0, "", [])
 
