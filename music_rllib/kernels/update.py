@@ -130,6 +130,16 @@ class Averages(NamedTuple):
     """Updates before the first one of this call."""
 
 
+class LearnedAlpha(NamedTuple):
+    """Learns ln alpha, so that a measure of the policy's randomness reaches a target."""
+
+    step: AdamStep
+    """Of ln alpha, the first number; without any, alpha is fixed."""
+    measure: int
+    """0: the entropy S_q; 1: the Shannon entropy; 2: the mean log standard deviation."""
+    target: float
+
+
 class Learned(NamedTuple):
     """Results of K updates, for metrics."""
 
@@ -356,13 +366,41 @@ def _average(averages: Averages, values: Array) -> None:
             averages.values[to + i] += tau * (values[begin + i] - averages.values[to + i])
 
 
+@compiled
+def _excess(learned: Learned, k: int, measure: int, target: float) -> float:
+    """Derivative of alpha's loss by ln alpha: the measure of update k, minus its target."""
+    rows, size = learned.log_density[k].shape
+    total: float = 0.0
+    for r in range(rows):
+        if measure == 0:
+            total -= learned.ln_q_pi[k, r]
+            continue
+        for a in range(size):
+            if measure == 1:
+                total -= learned.log_density[k, r, a]
+            else:
+                total += learned.log_std[k, r, a] / size
+    excess: float = total / rows - target
+    return excess
+
+
+@compiled
+def _tune(tuned: LearnedAlpha, learned: Learned, k: int) -> float:
+    """Take a step of ln alpha after update k, and return alpha."""
+    step = tuned.step
+    step.gradients[0] = _excess(learned, k, tuned.measure, tuned.target)
+    adam_step(step)
+    alpha: float = np.float64(np.exp(step.values[0]))
+    return alpha
+
+
 def _compiled_for(sources: str) -> Any:
     """`learn`, cached on disk: numba's key is this file's age and the values it encloses."""
 
     @kept_on_disk
     def learn(
         networks: Networks, batch: Batch, settings: UpdateSettings, policy_step: AdamStep,
-        step: AdamStep, averages: Averages, q: float, alpha: float, rows: int,
+        step: AdamStep, averages: Averages, tuned: LearnedAlpha, q: float, alpha: float, rows: int,
     ) -> Learned:  # fmt: skip
         """Do one update for each `rows` rows of the batch, in order.
 
@@ -380,6 +418,8 @@ def _compiled_for(sources: str) -> Any:
             if improves:
                 adam_step(policy_step)
             adam_step(step)
+            if improves and len(tuned.step.values) > 0:
+                alpha = _tune(tuned, learned, k)
             if number % averages.interval == 0:
                 _average(averages, networks.policy.values)
         return learned

@@ -18,11 +18,12 @@ from ray.rllib.core.columns import Columns
 from torch import Tensor, nn
 
 from music_rllib import names
+from music_rllib.kernels import update as kernel
 from music_rllib.kernels.adam import AdamStep, FlatParameters, FusedAdam
 from music_rllib.kernels.blas import use_threads
 from music_rllib.kernels.distribution import Distribution
 from music_rllib.kernels.layers import Array, Network, Normalized
-from music_rllib.kernels.update import Averages, Batch, Networks, UpdateSettings, learn
+from music_rllib.kernels.update import Averages, Batch, Networks, UpdateSettings
 from music_rllib.tac.networks import Critics, Perceptron, RunningNormaliser
 from music_rllib.tac.rl_module import EstimatorModule, TACModule
 
@@ -68,8 +69,6 @@ class Learned(NamedTuple):
     """[K] each, by the metric's name."""
     observed: dict[str, Tensor]
     """Arguments of `diagnostics.of_updates`."""
-    ln_q_pi: Tensor
-    """[K, B]"""
 
 
 class CompiledUpdate:
@@ -82,7 +81,7 @@ class CompiledUpdate:
 
     def __init__(self, module: TACModule) -> None:
         self._module = module
-        named = module.named_parameters()
+        named = list(module.named_parameters())
         trained = [p for name, p in named if p.requires_grad and name != "log_alpha"]
         self.flat = FlatParameters(trained)
         pairs = [
@@ -96,19 +95,22 @@ class CompiledUpdate:
         self._parts = np.array(parts, np.int64).reshape(-1, 3)
         policy = list(module.policy.parameters())
         self._of_policy = self.flat.start(next(iter(module.critics.parameters()))), len(policy)
+        of_alpha = [p for name, p in named if name == "log_alpha"]
+        self._log_alpha = FlatParameters(of_alpha) if of_alpha else None
         self._networks = self._arguments(module)
         self._settings = _settings_of(module)
 
     @property
     def is_in_use(self) -> bool:
         """Whether the parameters are still views; converting the module replaces them."""
-        return self.flat.is_in_use and self._averaged.is_in_use
+        flat = (self.flat, self._averaged, self._log_alpha)
+        return all(one is None or one.is_in_use for one in flat)
 
     def learn(
         self, batch: Mapping[str, Tensor], optimizer: FusedAdam | None, done: int,
-        entropic_index: float, alpha: float,
+        entropic_index: float, alpha: float, tuned: tuple[FusedAdam, int, float] | None = None,
     ) -> Learned:  # fmt: skip
-        """K updates, with their steps of Adam and of the target networks.
+        """K updates, with their steps of Adam, of the target networks and of a learned alpha.
 
         Args:
             batch: K concatenated minibatches, as documented in `minibatches`.
@@ -116,11 +118,14 @@ class CompiledUpdate:
             done: number of updates before these.
             entropic_index: q.
             alpha: entropy coefficient.
+            tuned: Adam of ln alpha, and measure and target of `kernels.update.LearnedAlpha`. None:
+                alpha is fixed.
         """
         settings = self._module.settings
+        empty = self.flat.values.numpy()[:0]
+        nothing = AdamStep(empty, empty, empty, empty, empty, 0.0, 0.0, 0.0, 0.0)
         if optimizer is None:
-            empty = self.flat.values.numpy()[:0]
-            policy_step = step = AdamStep(empty, empty, empty, empty, empty, 0.0, 0.0, 0.0, 0.0)
+            policy_step = step = nothing
             parts = self._parts[:0]
         else:
             policy_step, step = optimizer.step_of(self.flat).split(*self._of_policy)
@@ -137,11 +142,14 @@ class CompiledUpdate:
             batch.get("target_critics", self._all_critics(rewards)),
         )  # fmt: skip
         arrays = Batch(*(values.numpy() for values in columns))
-        found = learn(
-            self._networks, arrays, self._settings, policy_step, step, averages, entropic_index,
-            alpha, settings.batch_size,
+        learned_alpha = kernel.LearnedAlpha(nothing, 0, 0.0)
+        if tuned is not None and self._log_alpha is not None:
+            learned_alpha = kernel.LearnedAlpha(tuned[0].step_of(self._log_alpha), *tuned[1:])
+        found = kernel.learn(
+            self._networks, arrays, self._settings, policy_step, step, averages, learned_alpha,
+            entropic_index, alpha, settings.batch_size,
         )  # fmt: skip
-        losses, q_values, targets, log_density, log_std, ln_q_pi = map(torch.from_numpy, found)
+        losses, q_values, targets, log_density, log_std, _ = map(torch.from_numpy, found)
         critics, policy, value = losses.unbind(1)
         named = {names.CRITIC_LOSS: critics, names.POLICY_LOSS: policy}
         if self._settings.has_value:
@@ -149,7 +157,7 @@ class CompiledUpdate:
         observed = {"q_values": q_values, "targets": targets}
         if self._settings.distribution.stochastic:
             observed |= {"log_density": log_density, "log_std": log_std}
-        return Learned(named, observed, ln_q_pi)
+        return Learned(named, observed)
 
     def _all_critics(self, rewards: Tensor) -> Tensor:
         """[K*C] every critic for each update of [K*B] rows."""

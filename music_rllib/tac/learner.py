@@ -177,15 +177,12 @@ class TACLearner(TorchLearner):
         return {name: torch.stack([each[name] for each in history]) for name in history[0]}
 
     def _learn_compiled(self, minibatches: Minibatches) -> dict[str, Tensor]:
-        """Updates without autograd: all in one call, or one by one if alpha is learned."""
-        history = []
-        for part in minibatches.one_by_one() if "alpha" in self._adam else (minibatches,):
-            self._losses, self._observed = {}, {}
-            rewards = functools.partial(self._learn_music, part)
-            self._update_compiled(self._relabelled(part, rewards))
-            self._grad_updates += part.updates
-            history.append(self._losses | self._observed)
-        return {name: torch.cat([each[name] for each in history]) for name in history[0]}
+        """Updates without autograd, all in one call."""
+        self._losses, self._observed = {}, {}
+        rewards = functools.partial(self._learn_music, minibatches)
+        self._update_compiled(self._relabelled(minibatches, rewards))
+        self._grad_updates += minibatches.updates
+        return self._losses | self._observed
 
     @torch.no_grad()  # otherwise the targets would keep a graph of all their averages
     def _update_targets(self) -> None:
@@ -286,21 +283,17 @@ class TACLearner(TorchLearner):
         return loss
 
     def _update_compiled(self, minibatches: Minibatch) -> None:
-        """Update TAC's networks without autograd, and a learned alpha by one step."""
+        """Update TAC's networks and a learned alpha without autograd."""
         assert self._compiled is not None
         q, alpha = self._now.entropic_index, float(self._objective.alpha)
-        policy = minibatches[DEFAULT_MODULE_ID]
-        learned = self._compiled.learn(policy, self._adam["networks"], self._grad_updates, q, alpha)
+        policy, tuned = minibatches[DEFAULT_MODULE_ID], None
+        if "alpha" in self._adam:
+            tuned = self._adam["alpha"], *self._objective.alpha_target
+        learned = self._compiled.learn(
+            policy, self._adam["networks"], self._grad_updates, q, alpha, tuned
+        )
         self._losses |= learned.losses
         self._observed |= learned.observed
-        if "alpha" in self._adam and self._improves(self._grad_updates):
-            log_density, log_std = (
-                learned.observed[name][0] for name in ("log_density", "log_std")
-            )
-            self._policy_module.log_alpha.grad = self._objective.excess_entropy(
-                log_density, log_std, learned.ln_q_pi[0]
-            )
-            self._adam["alpha"].step()
 
     def _learn_music(self, minibatches: Minibatches) -> Tensor:
         """[K, B] intrinsic rewards, each minibatch's before the update of its networks."""

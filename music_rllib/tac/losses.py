@@ -209,13 +209,20 @@ class TACLoss:
 
         [] from log_density and log_std [B, A] and ln_q_pi [B]; the derivative of alpha's loss.
         """
+        which, target = self.alpha_target
+        measures = (-ln_q_pi.mean(), -log_density.sum(-1).mean(), log_std.mean())
+        return measures[which] - target
+
+    @property
+    def alpha_target(self) -> tuple[int, float]:
+        """Measure and target of a learned alpha, as `kernels.update.LearnedAlpha` has them."""
         alpha = self._settings.alpha
         assert isinstance(alpha, LearnedAlpha)
         if alpha.target_shannon is not None:
-            return -log_density.sum(-1).mean() - alpha.target_shannon
+            return 1, alpha.target_shannon
         if alpha.target_width is not None:
-            return log_std.mean() - math.log(alpha.target_width)
-        return -ln_q_pi.mean() - self._target_entropy
+            return 2, math.log(alpha.target_width)
+        return 0, self._target_entropy
 
     def _target_of(self, alpha: LearnedAlpha) -> float:
         """The target S_q; `auto` follows q."""

@@ -68,6 +68,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "MINE": {"music": {**MUSIC_U, "bound": "moving_average"}},
     "q measured, alpha scheduled": {"entropic_index": BY_ENTROPY, "alpha": {**RAMP, "start": 0.1}},
     "alpha learned": {"alpha": {"learned": True}, "bootstrap": "critics"},
+    "alpha learned for a Shannon entropy": {"alpha": {"learned": True, "target_shannon": -2.0}},
+    "alpha learned for a width": {"alpha": {"learned": True, "target_width": 0.1}},
     "ddpg": {
         **DDPG,
         "target_bounds": (-200.0, 0.0),

@@ -312,7 +312,7 @@ REDQ: dict[str, Any] = {
     "settings",
     [
         DDPG,
-        {"bootstrap": "critics"},
+        {"bootstrap": "critics", "alpha": {"learned": True}},
         PER | NOISE_AND_STEPS,
         REDQ,
         {"intrinsic.reward": "e3b"},
