@@ -257,3 +257,31 @@ def value_loss(
         loss += 0.5 * error * error / rows
         gradient[r, 0] = error / rows
     return loss
+
+
+@compiled
+def alpha_loss_backward(
+    ln_q_pi: Array, log_density: Array, log_std: Array, measure: int, target: float
+) -> float:
+    """Derivative of a learned alpha's loss by ln alpha: a mean of the policy minus its target.
+
+    Args:
+        ln_q_pi: [B] ln_q of the density.
+        log_density: [B, A] ln of the density.
+        log_std: [B, A] ln of the standard deviation.
+        measure: 0: the entropy S_q; 1: the Shannon entropy; 2: the mean of `log_std`.
+        target: value that the mean is to reach.
+    """
+    rows, size = log_density.shape
+    total: float = 0.0
+    for r in range(rows):
+        if measure == 0:
+            total -= ln_q_pi[r]
+            continue
+        for a in range(size):
+            if measure == 1:
+                total -= log_density[r, a]
+            else:
+                total += log_std[r, a] / size
+    excess: float = total / rows - target
+    return excess

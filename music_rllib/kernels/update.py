@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from music_rllib.functional import distribution as formulas
 from music_rllib.kernels import actor_critic, adam, blas, compiling, distribution, layers
 from music_rllib.kernels.actor_critic import (
+    alpha_loss_backward,
     critic_loss,
     critic_target,
     mean_values,
@@ -136,7 +137,7 @@ class LearnedAlpha(NamedTuple):
     step: AdamStep
     """Of ln alpha, the first number; without any, alpha is fixed."""
     measure: int
-    """0: the entropy S_q; 1: the Shannon entropy; 2: the mean log standard deviation."""
+    """As in `alpha_loss_backward`."""
     target: float
 
 
@@ -367,28 +368,12 @@ def _average(averages: Averages, values: Array) -> None:
 
 
 @compiled
-def _excess(learned: Learned, k: int, measure: int, target: float) -> float:
-    """Derivative of alpha's loss by ln alpha: the measure of update k, minus its target."""
-    rows, size = learned.log_density[k].shape
-    total: float = 0.0
-    for r in range(rows):
-        if measure == 0:
-            total -= learned.ln_q_pi[k, r]
-            continue
-        for a in range(size):
-            if measure == 1:
-                total -= learned.log_density[k, r, a]
-            else:
-                total += learned.log_std[k, r, a] / size
-    excess: float = total / rows - target
-    return excess
-
-
-@compiled
 def _tune(tuned: LearnedAlpha, learned: Learned, k: int) -> float:
     """Take a step of ln alpha after update k, and return alpha."""
     step = tuned.step
-    step.gradients[0] = _excess(learned, k, tuned.measure, tuned.target)
+    step.gradients[0] = alpha_loss_backward(
+        learned.ln_q_pi[k], learned.log_density[k], learned.log_std[k], tuned.measure, tuned.target
+    )
     adam_step(step)
     alpha: float = np.float64(np.exp(step.values[0]))
     return alpha

@@ -118,7 +118,7 @@ class CompiledUpdate:
             done: number of updates before these.
             entropic_index: q.
             alpha: entropy coefficient.
-            tuned: Adam of ln alpha, and measure and target of `kernels.update.LearnedAlpha`. None:
+            tuned: Adam of ln alpha, and measure and target of `alpha_loss_backward`. None:
                 alpha is fixed.
         """
         settings = self._module.settings

@@ -215,7 +215,7 @@ class TACLoss:
 
     @property
     def alpha_target(self) -> tuple[int, float]:
-        """Measure and target of a learned alpha, as `kernels.update.LearnedAlpha` has them."""
+        """Measure and target of a learned alpha, for the kernel `alpha_loss_backward`."""
         alpha = self._settings.alpha
         assert isinstance(alpha, LearnedAlpha)
         if alpha.target_shannon is not None:
