@@ -17,6 +17,8 @@ os.environ.update(
     {
         # Explicit, because Ray's default depends on earlier programs on the machine.
         "RAY_AUTH_MODE": "disabled",
+        # By default 15: tests would wait for workers that other tests starve.
+        "RAY_worker_niceness": "0",
         # More threads change the order of sums, and are slower on busy machines.
         "OMP_NUM_THREADS": "1",
         "NO_COLOR": "1",
