@@ -131,8 +131,8 @@ class Averages(NamedTuple):
     """Updates before the first one of this call."""
 
 
-class LearnedAlpha(NamedTuple):
-    """Learns ln alpha, so that a measure of the policy's randomness reaches a target."""
+class AlphaStep(NamedTuple):
+    """Arguments of a step of a learned ln alpha, towards a target of the policy's randomness."""
 
     step: AdamStep
     """Of ln alpha, the first number; without any, alpha is fixed."""
@@ -368,7 +368,7 @@ def _average(averages: Averages, values: Array) -> None:
 
 
 @compiled
-def _tune(tuned: LearnedAlpha, learned: Learned, k: int) -> float:
+def _tune(tuned: AlphaStep, learned: Learned, k: int) -> float:
     """Take a step of ln alpha after update k, and return alpha."""
     step = tuned.step
     step.gradients[0] = alpha_loss_backward(
@@ -385,7 +385,7 @@ def _compiled_for(sources: str) -> Any:
     @kept_on_disk
     def learn(
         networks: Networks, batch: Batch, settings: UpdateSettings, policy_step: AdamStep,
-        step: AdamStep, averages: Averages, tuned: LearnedAlpha, q: float, alpha: float, rows: int,
+        step: AdamStep, averages: Averages, tuned: AlphaStep, q: float, alpha: float, rows: int,
     ) -> Learned:  # fmt: skip
         """Do one update for each `rows` rows of the batch, in order.
 

@@ -84,6 +84,7 @@ class AnalysisPlan(_Strict):
 
     @property
     def stages_of_hypotheses(self) -> dict[str, frozenset[str]]:
+        """The stages that each hypothesis compares."""
         return {text: _stages_of([text], self.stage) for text in self.hypotheses}
 
     @property

@@ -18,12 +18,11 @@ from ray.rllib.core.columns import Columns
 from torch import Tensor, nn
 
 from music_rllib import names
-from music_rllib.kernels import update as kernel
 from music_rllib.kernels.adam import AdamStep, FlatParameters, FusedAdam
 from music_rllib.kernels.blas import use_threads
 from music_rllib.kernels.distribution import Distribution
 from music_rllib.kernels.layers import Array, Network, Normalized
-from music_rllib.kernels.update import Averages, Batch, Networks, UpdateSettings
+from music_rllib.kernels.update import AlphaStep, Averages, Batch, Networks, UpdateSettings, learn
 from music_rllib.tac.networks import Critics, Perceptron, RunningNormaliser
 from music_rllib.tac.rl_module import EstimatorModule, TACModule
 
@@ -142,11 +141,11 @@ class CompiledUpdate:
             batch.get("target_critics", self._all_critics(rewards)),
         )  # fmt: skip
         arrays = Batch(*(values.numpy() for values in columns))
-        learned_alpha = kernel.LearnedAlpha(nothing, 0, 0.0)
+        alpha_step = AlphaStep(nothing, 0, 0.0)
         if tuned is not None and self._log_alpha is not None:
-            learned_alpha = kernel.LearnedAlpha(tuned[0].step_of(self._log_alpha), *tuned[1:])
-        found = kernel.learn(
-            self._networks, arrays, self._settings, policy_step, step, averages, learned_alpha,
+            alpha_step = AlphaStep(tuned[0].step_of(self._log_alpha), *tuned[1:])
+        found = learn(
+            self._networks, arrays, self._settings, policy_step, step, averages, alpha_step,
             entropic_index, alpha, settings.batch_size,
         )  # fmt: skip
         losses, q_values, targets, log_density, log_std, _ = map(torch.from_numpy, found)
