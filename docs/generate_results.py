@@ -10,7 +10,7 @@ trained them; otherwise it has the runs of the export docs/results/data/NAME. KI
 
 - without NAME, over the three studies of q: `headline`, `summary`, `sampled` or `robustness`;
 - for a planned study: `verdict` (with the hypothesis), `answer`, `outcomes` (with stages),
-  `seeds`, `cells`, `figure` (with its name), `learning`, `arms`, `equal-total`, `hours` or
+  `seeds`, `cells`, `figure` (with its name), `learning`, `arms`, `peers`, `equal-total`, `hours` or
   `progress`;
 - for any sweep: `totals` (with a pretrained stage and one from scratch), `runs`, `provenance`,
   `success`, `stages` or `curves` (with stages, if not all), `metric` (with metrics), or `search`.
@@ -26,7 +26,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from docs.result_pages.exports import hours_text, progress_text, sweep_called
-from docs.result_pages.learning import learning_figure, overview
+from docs.result_pages.learning import learning_figure, overview, peers_figure
 from docs.result_pages.robustness import robustness_list
 from docs.result_pages.runs import metric_table, provenance, runs_table
 from docs.result_pages.searches import search_text
@@ -102,6 +102,7 @@ def page(name: str, figures: dict[str, bytes]) -> str:
         "learning": lambda sweep: learning_figure(sweep, figures),
         "totals": totals_table,
         "arms": arms_table,
+        "peers": lambda sweep: peers_figure(sweep, figures),
         "runs": runs_table,
         "provenance": lambda sweep: [provenance(sweep)],
         "success": lambda sweep, *stages: success(sweep, figures, stages),

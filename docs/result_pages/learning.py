@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 from matplotlib.axes import Axes
 
+from docs.result_pages.exports import is_complete
 from docs.result_pages.figures import figure
 from docs.result_pages.summary import STUDIES, compared, complete_studies
 from music_rllib import names
@@ -42,6 +43,27 @@ def learning_figure(sweep: Sweep, figures: dict[str, bytes]) -> Iterator[str]:
             _subplot("sampled policy", sampled, legend),
         ),
         legend=list(legend.values()),
+    )
+    yield from figure(sweep, drawing, figures)
+
+
+def peers_figure(sweep: Sweep, figures: dict[str, bytes]) -> Iterator[str]:
+    """A subplot for each stage that a plan compares with another one; none until it is complete."""
+    if not is_complete(sweep):
+        return
+    styles = {"HER alone": SCRATCH[1], "with the reward": Style("#1f7fc4", "o")}
+    subplots = []
+    for claim in study_of(sweep).planned:
+        ((own, other),) = claim.pairs
+        legend = dict(zip((other, own), styles.items(), strict=True))
+        curves = [_shifted(sweep, curve(sweep, c, claim.task, SUCCESS.name)) for c in legend]
+        subplots.append(_subplot(dict(own.others)["stage"], curves, legend))
+    drawing = Drawing(
+        stage="rewards",
+        title="Success",
+        caption="",
+        subplots=tuple(subplots),
+        legend=list(styles.items()),
     )
     yield from figure(sweep, drawing, figures)
 

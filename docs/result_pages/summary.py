@@ -20,6 +20,7 @@ JOINT = "joint entropy, HER alone"
 MUSIC = "per-dimension entropy, MUSIC-r"
 STUDIES = {
     "joint-music": "joint entropy, MUSIC-r",
+    "equal-entropy": "joint entropy at 1.5 nats, MUSIC-r",
     "joint-her": JOINT,
     "claims-push": MUSIC,
     "claims-pick-and-place": MUSIC,
@@ -70,12 +71,24 @@ def between_q(claims: Sequence[Claim]) -> list[Claim]:
 
 
 def headline() -> str:
-    """A sentence per setting: the effect of q on each task, by the verdicts on the mean action."""
+    """Whether q = 1.5 is better than q = 1 anywhere; then a sentence per setting.
+
+    The sentences state the effect of q on each task, by the verdicts on the mean action.
+    """
     settings: dict[str, list[Claim]] = {}
     for sweep, study in complete_studies():
         settings.setdefault(STUDIES[sweep.name], []).extend(between_q(study.planned))
+    better = [
+        f"{claim.task} ({setting})"
+        for setting, claims in settings.items()
+        for claim in claims
+        if (claim.first, claim.second) == ("q = 1.5", "q = 1") and claim.verdict is Verdict.SUPERIOR
+    ]
+    answer = "In no setting tested here is q = 1.5 better than q = 1."
+    if better:
+        answer = f"q = 1.5 is better than q = 1 on {' and '.join(better)}."
     sentences = (f"{setting}: {_effects(claims)}." for setting, claims in settings.items())
-    return f"**{' '.join(text[0].upper() + text[1:] for text in sentences)}**"
+    return f"**{answer}** {' '.join(text[0].upper() + text[1:] for text in sentences)}"
 
 
 def _effects(claims: Sequence[Claim]) -> str:

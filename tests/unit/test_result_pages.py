@@ -97,4 +97,7 @@ def test_the_first_sentence_follows_the_verdicts(
     monkeypatch.setattr(
         summary, "complete_studies", lambda: [(replace(runs, name="joint-her"), study)]
     )
-    assert summary.headline() == f"**Joint entropy, HER alone: {sentence}.**"
+    answer = "In no setting tested here is q = 1.5 better than q = 1."
+    if verdicts[0] is Verdict.SUPERIOR:
+        answer = "q = 1.5 is better than q = 1 on FetchPush (joint entropy, HER alone)."
+    assert summary.headline() == f"**{answer}** Joint entropy, HER alone: {sentence}."

@@ -25,6 +25,7 @@ ENTROPIES = ("entropy/shannon", "entropy/tsallis")
 JOINT, MUSIC = "joint entropy, HER alone", "per-dimension entropy, MUSIC-r"
 STUDIES = {  # export and compared stage
     ("FetchPush", "joint entropy, MUSIC-r"): ("joint-music", "music-r"),
+    ("FetchPush", "joint entropy at 1.5 nats, MUSIC-r"): ("equal-entropy", "music-r"),
     ("FetchPush", JOINT): ("joint-her", "her"),
     ("FetchPush", MUSIC): ("claims-push", "music-r"),
     ("FetchPickAndPlace", MUSIC): ("claims-pick-and-place", "music-r"),
@@ -32,6 +33,8 @@ STUDIES = {  # export and compared stage
 }
 TOTALS = {"claims-pick-and-place": 200_000, "joint-music": 30_000}
 """Steps with pretraining at which MUSIC-r is compared with HER alone."""
+COUNTED = {"joint-music": 30_000, "equal-entropy": 30_000}
+"""Steps of the studies whose metric counts the pretraining."""
 BETWEEN_Q = (("1.5", "1"), ("2", "1.5"), ("2", "1"))
 KINDS = ("p", "tost")
 Claim = dict[str, Any]
@@ -70,8 +73,8 @@ def area(steps: Array, values: Array, budget: float) -> float:
 @cache
 def areas(study: str, stage: str, q: str, metric: str) -> pd.Series:
     """The area of each seed, averaged over the values of alpha."""
-    if study == "joint-music":
-        return areas_of_all_steps(study, stage, metric, TOTALS[study], q)
+    if study in COUNTED:
+        return areas_of_all_steps(study, stage, metric, COUNTED[study], q)
     own = runs(study, stage).query("q == @q")
     values = [area(*curve(study, run, metric), own.budget.min()) for run in own.run]
     return pd.Series(values, own.seed).groupby(level=0).mean()
