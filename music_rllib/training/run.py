@@ -262,9 +262,10 @@ class TrainingRun:
         diverged = have_diverged(means, bonuses, reward, run.tac.gamma)
         if not diverged[-1] or diverged[:-1].any():
             return None
+        remedy = "" if run.tac.target_bounds else "; tac.target_bounds limits their targets"
         return (
             f"its critics diverge: {means[-1]:.3g} on average, with rewards of {reward} a step "
-            f"at gamma {run.tac.gamma:g}"
+            f"at gamma {run.tac.gamma:g}{remedy}"
         )
 
     def close(self) -> None:

@@ -129,6 +129,7 @@ def test_diverged_critics_are_reported_once(tmp_path: Path) -> None:
     results = compute(job(tmp_path, settings("tac", task=task, tac=tac)))
     (note,) = [note for result in results for note in result[NOTES] if "critics" in note]
     assert re.match(r"its critics diverge: \S+ on average, with rewards of -1e-06 to 0 ", note)
+    assert note.endswith("; tac.target_bounds limits their targets")
 
 
 def test_every_variant_trains_from_its_source(pretrained: NodeJob) -> None:
