@@ -17,9 +17,10 @@ from pydantic import BaseModel
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.schema import ImportedHandoff, Source, Stage, SweepConfig
 from music_rllib.config.search import of_stage
+from music_rllib.config.tac_settings import LearnedAlpha
 from music_rllib.envs.tasks import Task
 from music_rllib.names import in_runs
-from music_rllib.schedules import Linear
+from music_rllib.schedules import Linear, extremes
 from music_rllib.store.serialization import content_key
 from music_rllib.version import ALGORITHM_VERSION
 
@@ -250,15 +251,36 @@ class Plan:
         return Input(key=run.key, task=task), values
 
 
-def shared_runs(plan: Plan) -> list[str]:
+def remarks(plan: Plan) -> list[str]:
+    """A line for each property of a valid plan that may be unintended."""
+    return [*_shared_runs(plan), *_unbounded_alphas(plan)]
+
+
+def _shared_runs(plan: Plan) -> Iterator[str]:
     """A line about each stage with runs whose settings are all equal to an earlier stage's."""
     counts = Counter((run.stage, plan.node(run.key).stage) for run in plan.runs)
-    return [
-        f"{stage}: {in_runs(count)} equal to runs of {first}: trained once, and counted for "
-        f"{first} only in reports, comparisons and hypotheses"
-        for (stage, first), count in counts.items()
-        if stage != first
-    ]
+    for (stage, first), count in counts.items():
+        if stage != first:
+            yield (
+                f"{stage}: {in_runs(count)} equal to runs of {first}: trained once, and counted "
+                f"for {first} only in reports, comparisons and hypotheses"
+            )
+
+
+def _unbounded_alphas(plan: Plan) -> Iterator[str]:
+    """A line if runs learn α at q >= 2 in the joint form without bounds for the critics."""
+    count = sum(
+        isinstance(run.tac.alpha, LearnedAlpha)
+        and run.tac.entropy_form == "joint"
+        and extremes(run.tac.entropic_index)[1] >= 2.0
+        and run.tac.target_bounds is None
+        for run in plan.settings
+    )
+    if count:
+        yield (
+            f"{in_runs(count)} with q >= 2 and the joint entropy, where a learned alpha can make "
+            "critics diverge: set tac.target_bounds (docs/comparing_q.md)"
+        )
 
 
 def short(value: Any, setting: str) -> str:

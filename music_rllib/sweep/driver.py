@@ -33,7 +33,7 @@ from music_rllib.experiment.open_sweep import (
     remove_runs,
     reopened,
 )
-from music_rllib.experiment.plan import make_plan, shared_runs
+from music_rllib.experiment.plan import make_plan, remarks
 from music_rllib.experiment.sweep_files import ANALYSIS_PLAN, STATE
 from music_rllib.redaction import redact
 from music_rllib.runtime.machine import (
@@ -203,7 +203,7 @@ def _open(
     cluster = preflight.find_cluster(console, opened, wait_minutes)
     memory = None if cluster is None else cluster.node_memory
     check_demand(opened, memory)
-    warnings = (*warnings_of(config), *shared_runs(planned), *continued_runs_text(opened))
+    warnings = (*warnings_of(config), *remarks(planned), *continued_runs_text(opened))
     for line in filter(None, (remark, *played, *warnings)):
         _say(console, line, "yellow")
     return opened, cluster

@@ -20,7 +20,7 @@ from music_rllib.config.search import SearchSettings
 from music_rllib.config.tac_settings import MatchedAlpha, NormalisedAlpha, alpha_at, setting_text
 from music_rllib.envs.tasks import Task
 from music_rllib.experiment.open_sweep import OpenSweep, plan_node
-from music_rllib.experiment.plan import Node, Plan, shared_runs, short
+from music_rllib.experiment.plan import Node, Plan, remarks, short
 from music_rllib.names import in_runs
 from music_rllib.redaction import redact
 from music_rllib.schedules import Linear, Measured, Piecewise, value_at
@@ -181,7 +181,7 @@ def plan_answer(opened: OpenSweep, changes: str) -> dict[str, Any]:
         "env_steps_left": sum(node["env_steps"] for node in nodes if not node["finished"]),
         "nodes": nodes,
         "searches": searches,
-        "remarks": [*warnings_of(config), *shared_runs(plan)],
+        "remarks": [*warnings_of(config), *remarks(plan)],
         "alpha": alpha_rows(plan),
         "changes": changes or None,
     }

@@ -11,7 +11,7 @@ from music_rllib.config.problems import ConfigError
 from music_rllib.config.run_settings import RunSettings, variant_music
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.experiment import plan as plan_module
-from music_rllib.experiment.plan import Plan, make_plan, node_key, shared_runs
+from music_rllib.experiment.plan import Plan, make_plan, node_key, remarks
 from music_rllib.names import label_matches
 
 Document = dict[str, Any]
@@ -92,11 +92,36 @@ def test_equal_computations_are_one_node(tmp_path: Path) -> None:
     assert len(sweep.nodes) == 4
     direct = plan(tmp_path, stages=[PRETRAIN, FINETUNE])
     assert {node.key for node in direct.nodes} == {node.key for node in sweep.nodes}
-    assert shared_runs(direct) == []
-    assert shared_runs(sweep) == [
+    assert remarks(direct) == []
+    assert remarks(sweep) == [
         "twin: 1 run equal to runs of pretrain: trained once, and counted for pretrain only in "
         "reports, comparisons and hypotheses"
     ]
+
+
+@pytest.mark.parametrize(
+    ("tac", "count"),
+    [
+        ({"entropic_index": 2.0, "entropy_form": "joint", "alpha": {"learned": True}}, 1),
+        ({"entropic_index": 1.5, "entropy_form": "joint", "alpha": {"learned": True}}, 0),
+        ({"entropic_index": 2.0, "entropy_form": "joint", "alpha": 0.1}, 0),
+        ({"entropic_index": 2.0, "alpha": {"learned": True}}, 0),
+        (
+            {
+                "entropic_index": 2.0,
+                "entropy_form": "joint",
+                "alpha": {"learned": True},
+                "target_bounds": [-50, 50],
+            },
+            0,
+        ),
+    ],
+)
+def test_a_learned_alpha_that_can_diverge_is_remarked(
+    tac: dict[str, object], count: int, tmp_path: Path
+) -> None:
+    sweep = plan(tmp_path, stages=[PRETRAIN | {"tac": tac}])
+    assert ["1 run with q >= 2" in line for line in remarks(sweep)] == [True] * count
 
 
 def test_another_tasks_estimator(tmp_path: Path) -> None:
