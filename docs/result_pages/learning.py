@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 
 from docs.result_pages.exports import is_complete
 from docs.result_pages.figures import figure
-from docs.result_pages.summary import STUDIES, compared, complete_studies
+from docs.result_pages.summary import BETWEEN_STAGES, STUDIES, compared, complete_studies
 from music_rllib import names
 from music_rllib.report.figures.choice import Drawing
 from music_rllib.report.figures.draw import files
@@ -57,7 +57,7 @@ def peers_figure(sweep: Sweep, figures: dict[str, bytes]) -> Iterator[str]:
         ((own, other),) = claim.pairs
         legend = dict(zip((other, own), styles.items(), strict=True))
         curves = [_shifted(sweep, curve(sweep, c, claim.task, SUCCESS.name)) for c in legend]
-        subplots.append(_subplot(dict(own.others)["stage"], curves, legend))
+        subplots.append(_subplot(claim.first.removeprefix(BETWEEN_STAGES), curves, legend))
     drawing = Drawing(
         stage="rewards",
         title="Success",

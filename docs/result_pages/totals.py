@@ -12,7 +12,7 @@ from docs.result_pages.words import percent, rate_cells, row, rule, spread
 from music_rllib import names
 from music_rllib.results.analysis import analyse_stage
 from music_rllib.results.analysis_plan import MARGIN_OF_A_RATE
-from music_rllib.results.answer import numbers_in_words, verdict_in_words
+from music_rllib.results.answer import not_excluded, numbers_in_words, verdict_in_words
 from music_rllib.results.claims import Claim, contrast, exploratory
 from music_rllib.results.conditions import Condition, find_stages
 from music_rllib.results.data import Sweep, with_pretraining
@@ -113,14 +113,17 @@ def arms_table(sweep: Sweep) -> Iterator[str]:
         for final in scope.finals
     }
     yield row(
-        "arm", "verdict, difference", "area over all steps [95% CI]", "success at the end",
-        "minutes a run", "seeds",
+        "stage", "verdict, difference", "area over all steps [95% CI]", "success at the end",
+        "minutes per run", "seeds",
     )  # fmt: skip
     yield rule(6)
     for mean in study.means:
         name = dict(mean.condition.others)["stage"]
         claim = claims.get(name)
-        against = f"**{verdict_in_words(claim)}**, {numbers_in_words(claim)}" if claim else ""
+        against = ""
+        if claim:
+            numbers = numbers_in_words(claim)
+            against = f"**{verdict_in_words(claim)}**, {numbers}{not_excluded(claim)}"
         minutes = np.mean([sweep.runs[run].seconds or 0.0 for run in mean.condition.runs]) / 60
         yield row(
             name, against, spread(mean.estimate), rate_cells(finals[mean.condition])[0],

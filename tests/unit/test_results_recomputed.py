@@ -152,8 +152,8 @@ def in_words(claim: Claim, *, planned: bool) -> str:
     own = p_text(claim[kind])
     if not planned:
         return f"{interval}; unadjusted {own})"
-    adjusted = p_text(claim["adjusted " + kind]).removeprefix("p = ")
-    more = "" if own.endswith(adjusted) else f", adjusted {adjusted}"
+    adjusted = p_text(claim["adjusted " + kind])
+    more = "" if own == adjusted else f", adjusted {adjusted.removeprefix('p = ')}"
     rate = f"; collapses in up to {100 * claim['collapses']:.0f}% of seeds are not excluded"
     words = f"**{claim['verdict']}**, {interval}; {'TOST ' * alike}{own}{more})"
     shown = claim["verdict"] != "undecided" and claim["collapses"] >= 0.05
@@ -168,9 +168,9 @@ def p_text(p: float) -> str:
     return "p < 0.001" if p < 0.001 else f"p = {p:.2g}"
 
 
-def table(after: str) -> list[list[str]]:
-    """The cells of the first table after a text of the page."""
-    lines = PAGE[PAGE.index(after) :].splitlines()
+def table(after: str, page: str = PAGE) -> list[list[str]]:
+    """The cells of the first table after a text of a page."""
+    lines = page[page.index(after) :].splitlines()
     start = next(i for i, line in enumerate(lines) if line.startswith("|"))
     stop = next(i for i in range(start, len(lines)) if not lines[i].startswith("|"))
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[start:stop]]
@@ -290,6 +290,25 @@ def test_the_verdicts_without_one_seed() -> None:
                 f"{claim['seeds']} cases"
             )
     assert re.findall(r"^(- q = .* cases)[;.]", PAGE, re.MULTILINE) == expected
+
+
+def test_every_row_of_the_table_of_intrinsic_rewards() -> None:
+    """Each reward against hindsight alone; the plan has eight of them."""
+    study, total = "intrinsic-rewards", 20_000
+    text = (DOCS / "lab/claims.md").read_text("utf-8")
+    header, _, her, *rows = table("## Intrinsic rewards on FetchPush", text)
+    assert header[1:4] == ["verdict, difference", "area over all steps [95% CI]", header[3]]
+    stages = [row[0] for row in rows]
+    scores = {stage: areas_of_all_steps(study, stage, MEAN, total) for stage in ("her", *stages)}
+    claims = [compared(scores[stage], scores["her"]) for stage in stages]
+    claims = decided(claims, dropped=8 - len(rows))
+    assert [row[1] for row in rows] == [in_words(claim, planned=True) for claim in claims]
+    for row in (her, *rows):
+        values = rate_interval(scores[row[0]].to_numpy(), np.inf)
+        assert row[2] == "{} [{}, {}]".format(*map(two_decimals, values))
+        finals = [curve(study, run, MEAN)[1][-1] for run in runs(study, row[0]).run]
+        assert row[3] == "{:.0%} [{:.0%}, {:.0%}]".format(*rate_interval(np.array(finals), 50))
+        assert row[5] == str(len(finals))
 
 
 def test_every_figure_of_the_readme_is_on_the_page() -> None:
