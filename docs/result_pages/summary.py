@@ -12,7 +12,8 @@ from docs.result_pages.words import percent, row, rule
 from music_rllib import names
 from music_rllib.results.answer import not_excluded, numbers_in_words, verdict_in_words
 from music_rllib.results.claims import Claim, Verdict, claims_of, exploratory
-from music_rllib.results.data import Sweep, with_pretraining
+from music_rllib.results.data import Sweep
+from music_rllib.results.pretraining import with_pretraining
 from music_rllib.results.scores import Measure
 from music_rllib.results.study import Study, study_of
 

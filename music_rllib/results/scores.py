@@ -26,7 +26,7 @@ class Measure:
 
     kind: str
     """`auc`: the mean of `metric` over the budget, the area under its curve. `auc_total`: the same
-    with the steps of pretraining (`data.with_pretraining`). `final`: its last value."""
+    with the steps of pretraining (`pretraining.with_pretraining`). `final`: its last value."""
     metric: str
     horizon: float
     """Environment steps of the area: the smallest budget of the compared runs. NaN for several

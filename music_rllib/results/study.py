@@ -30,7 +30,8 @@ from music_rllib.results.conditions import (
     stages_together,
     whole_setting,
 )
-from music_rllib.results.data import RunRecord, Sweep, with_pretraining
+from music_rllib.results.data import RunRecord, Sweep
+from music_rllib.results.pretraining import with_pretraining
 from music_rllib.results.scores import Measure, Scores, first_result, measure_on, scores_of
 from music_rllib.results.statistics import Estimate
 
