@@ -7,10 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from docs.result_pages.summary import STUDIES, between_q, complete_studies, counted
+from docs.result_pages.summary import STUDIES, between_q, complete_studies
 from music_rllib.results.answer import p_in_words
 from music_rllib.results.claims import Claim, Contrast, Verdict, contrast, decided
 from music_rllib.results.data import Sweep
+from music_rllib.results.pretraining import counted
 from music_rllib.results.scores import scores_of
 
 MORE = {"claims-slide": 1}
@@ -22,7 +23,7 @@ def robustness_list() -> Iterator[str]:
     for sweep, study in complete_studies():
         for at, claim in enumerate(study.planned):
             if claim in between_q(study.planned) and claim.verdict is not Verdict.UNDECIDED:
-                yield f"- {_stability(counted(sweep, claim.measure), study.planned, at)}."
+                yield f"- {_stability(counted(sweep, claim.measure.kind), study.planned, at)}."
 
 
 def _stability(sweep: Sweep, planned: Sequence[Claim], at: int) -> str:

@@ -10,7 +10,6 @@ import numpy as np
 from docs.result_pages.exports import config_of, is_complete, progress_text, sweep_called
 from docs.result_pages.figures import figure
 from docs.result_pages.runs import last_value
-from docs.result_pages.summary import counted
 from docs.result_pages.words import percent, rate_cells, row, rule, spread, wait_text
 from music_rllib import names
 from music_rllib.report.figures.choice import slug, stage_drawings, study_drawings
@@ -19,6 +18,7 @@ from music_rllib.results.analysis import THRESHOLDS, StageAnalysis, analyse
 from music_rllib.results.analysis_plan import analysis_plan
 from music_rllib.results.answer import answer, not_excluded, numbers_in_words, verdict_in_words
 from music_rllib.results.data import Sweep
+from music_rllib.results.pretraining import counted
 from music_rllib.results.scores import scores_of
 from music_rllib.results.study import Mean, study_of
 
@@ -90,7 +90,7 @@ def _outcomes(sweep: Sweep, analysis: StageAnalysis, mean: Mean, prefix: str) ->
     yield f"{prefix}{mean.condition.short_label}"
     yield spread(mean.estimate)
     measure = replace(mean.measure, metric=names.TRAIN_SUCCESS)
-    sampled = scores_of(counted(sweep, measure), mean.condition, mean.task, measure)
+    sampled = scores_of(counted(sweep, measure.kind), mean.condition, mean.task, measure)
     yield spread(st.estimate(np.array([*sampled.by_seed.values()])[:, np.newaxis], np.inf))
     yield rate_cells(final)[0]
     for wait in analysis.times:

@@ -13,8 +13,7 @@ from music_rllib import names
 from music_rllib.results.answer import not_excluded, numbers_in_words, verdict_in_words
 from music_rllib.results.claims import Claim, Verdict, claims_of, exploratory
 from music_rllib.results.data import Sweep
-from music_rllib.results.pretraining import with_pretraining
-from music_rllib.results.scores import Measure
+from music_rllib.results.pretraining import counted
 from music_rllib.results.study import Study, study_of
 
 JOINT = "joint entropy, HER alone"
@@ -57,13 +56,8 @@ def sampled(sweep: Sweep, study: Study) -> tuple[Claim, ...]:
     first, *_ = claims = compared(study)
     pairs = [(claim.first, claim.second, claim.pairs) for claim in claims]
     measures = {first.task: replace(first.measure, metric=names.TRAIN_SUCCESS)}
-    sweep = counted(sweep, first.measure)
+    sweep = counted(sweep, first.measure.kind)
     return exploratory(list(claims_of(sweep, pairs, measures, first.margin)))
-
-
-def counted(sweep: Sweep, measure: Measure) -> Sweep:
-    """The sweep with the environment steps that the measure counts."""
-    return with_pretraining(sweep) if measure.kind == "auc_total" else sweep
 
 
 def between_q(claims: Sequence[Claim]) -> list[Claim]:

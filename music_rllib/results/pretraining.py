@@ -60,3 +60,8 @@ def with_pretraining(sweep: Sweep) -> Sweep:
         for run, chain in zip(sweep.runs, chains, strict=True)
     ]
     return replace(sweep, runs=runs, history=history)
+
+
+def counted(sweep: Sweep, kind: str) -> Sweep:
+    """The sweep with the environment steps that a measure of this kind counts."""
+    return with_pretraining(sweep) if kind == "auc_total" else sweep

@@ -31,7 +31,7 @@ from music_rllib.results.conditions import (
     whole_setting,
 )
 from music_rllib.results.data import RunRecord, Sweep
-from music_rllib.results.pretraining import with_pretraining
+from music_rllib.results.pretraining import counted
 from music_rllib.results.scores import Measure, Scores, first_result, measure_on, scores_of
 from music_rllib.results.statistics import Estimate
 
@@ -132,15 +132,15 @@ def study_of(
         kind, margin = "auc", None
         if latest is not None and metric is None:
             kind, margin = latest.plan.metric, latest.plan.margin
-        counted = _counted(sweep, kind)
+        counted_sweep = counted(sweep, kind)
         measures = {
-            task: measure_on(counted, task, _runs(chosen), kind, metric, maximised=maximised)
+            task: measure_on(counted_sweep, task, _runs(chosen), kind, metric, maximised=maximised)
             for task in chosen.tasks
         }
-        means += _means(counted, chosen, measures)
+        means += _means(counted_sweep, chosen, measures)
         labelled = [(x.short_label, y.short_label, [(x, y)]) for x, y in pairs]
         known_subjects = {claim.subject for claim in (*planned, *unplanned)}
-        of_stage = claims_of(counted, labelled, measures, margin)
+        of_stage = claims_of(counted_sweep, labelled, measures, margin)
         unplanned += [claim for claim in of_stage if claim.subject not in known_subjects]
     of_plan = [stages[name] for name in (plan.plan.stages if plan else ()) if name in stages]
     compared = [run for one in filter(None, [chosen, *of_plan]) for run in _runs(one)]
@@ -156,11 +156,6 @@ def study_of(
         family=len(planned) + without_test if plan else len(unplanned),
         runs=tuple(dict.fromkeys(compared)),
     )
-
-
-def _counted(sweep: Sweep, kind: str) -> Sweep:
-    """The sweep with the environment steps that a measure of this kind counts."""
-    return with_pretraining(sweep) if kind == "auc_total" else sweep
 
 
 def _runs(stage: StageRuns) -> list[int]:
@@ -198,7 +193,7 @@ def _of_plan(
     untested: list[str],
 ) -> Iterator[Claim]:
     """The undecided claims of a plan's hypotheses without the `known` ones; fills `untested`."""
-    sweep = _counted(sweep, version.plan.metric)
+    sweep = counted(sweep, version.plan.metric)
     for text in version.plan.hypotheses:
         if text in known:
             continue
