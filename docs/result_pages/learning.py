@@ -20,7 +20,7 @@ from music_rllib.results import statistics as st
 from music_rllib.results.analysis import Curve, curve
 from music_rllib.results.conditions import Condition, find_stages
 from music_rllib.results.data import Sweep
-from music_rllib.results.pretraining import with_pretraining
+from music_rllib.results.scores import with_pretraining
 from music_rllib.results.statistics import Array
 from music_rllib.results.study import study_of
 

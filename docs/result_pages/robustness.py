@@ -11,8 +11,7 @@ from docs.result_pages.summary import STUDIES, between_q, complete_studies
 from music_rllib.results.answer import p_in_words
 from music_rllib.results.claims import Claim, Contrast, Verdict, contrast, decided
 from music_rllib.results.data import Sweep
-from music_rllib.results.pretraining import counted
-from music_rllib.results.scores import scores_of
+from music_rllib.results.scores import counted, scores_of
 
 MORE = {"claims-slide": 1}
 """Number of hypotheses dropped from a study before its first run."""

@@ -18,8 +18,7 @@ from music_rllib.results.analysis import THRESHOLDS, StageAnalysis, analyse
 from music_rllib.results.analysis_plan import analysis_plan
 from music_rllib.results.answer import answer, not_excluded, numbers_in_words, verdict_in_words
 from music_rllib.results.data import Sweep
-from music_rllib.results.pretraining import counted
-from music_rllib.results.scores import scores_of
+from music_rllib.results.scores import counted, scores_of
 from music_rllib.results.study import Mean, study_of
 
 

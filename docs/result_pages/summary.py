@@ -13,7 +13,7 @@ from music_rllib import names
 from music_rllib.results.answer import not_excluded, numbers_in_words, verdict_in_words
 from music_rllib.results.claims import Claim, Verdict, claims_of, exploratory
 from music_rllib.results.data import Sweep
-from music_rllib.results.pretraining import counted
+from music_rllib.results.scores import counted
 from music_rllib.results.study import Study, study_of
 
 JOINT = "joint entropy, HER alone"

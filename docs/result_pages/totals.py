@@ -16,8 +16,7 @@ from music_rllib.results.answer import not_excluded, numbers_in_words, verdict_i
 from music_rllib.results.claims import Claim, contrast, exploratory
 from music_rllib.results.conditions import Condition, find_stages
 from music_rllib.results.data import Sweep
-from music_rllib.results.pretraining import with_pretraining
-from music_rllib.results.scores import Measure, area_under_curve
+from music_rllib.results.scores import Measure, area_under_curve, with_pretraining
 from music_rllib.results.study import study_of
 
 

@@ -8,7 +8,7 @@ values do not differ once all runs are at the ceiling.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from music_rllib import names
 from music_rllib.results.conditions import Condition
-from music_rllib.results.data import Sweep
+from music_rllib.results.data import Column, History, Sweep, joined
 from music_rllib.results.statistics import Array
 
 
@@ -26,7 +26,7 @@ class Measure:
 
     kind: str
     """`auc`: the mean of `metric` over the budget, the area under its curve. `auc_total`: the same
-    with the steps of pretraining (`pretraining.with_pretraining`). `final`: its last value."""
+    with the steps of pretraining (`with_pretraining`). `final`: its last value."""
     metric: str
     horizon: float
     """Environment steps of the area: the smallest budget of the compared runs. NaN for several
@@ -217,3 +217,60 @@ def first_result(sweep: Sweep, runs: Iterable[int]) -> float:
         if record.is_finished and len(times):
             ends.append(float(times[-1]))
     return min(ends, default=np.inf)
+
+
+class _Computed(Mapping[str, Column]):
+    """Columns computed from those of another history when they are first read."""
+
+    def __init__(self, history: History, of: Callable[[Column], Column]) -> None:
+        self._history, self._of = history, of
+        self._known: dict[str, Column] = {}
+
+    def __getitem__(self, metric: str) -> Column:
+        if metric not in self._known:
+            self._known[metric] = self._of(self._history[metric])
+        return self._known[metric]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._history)
+
+    def __len__(self) -> int:
+        return len(self._history)
+
+
+def with_pretraining(sweep: Sweep) -> Sweep:
+    """The sweep with steps that count from the first step of each run's pretraining.
+
+    A run that starts from another run of the sweep has the curves of that run before its own, and
+    its budget is the sum of both.
+    """
+    position = {run.node_key: i for i, run in enumerate(sweep.runs) if run.node_key}
+    budgets = [run.budget or sweep.last_step(i) for i, run in enumerate(sweep.runs)]
+    chains = [[i] for i in range(len(budgets))]
+    for chain in chains:  # each ends with the run, and begins with the one from scratch
+        while (source := position.get(sweep.runs[chain[0]].source, -1)) not in (-1, *chain):
+            chain.insert(0, source)
+
+    def whole(column: Column, chain: Sequence[int]) -> Column:
+        before, parts = 0, []
+        for part in chain:
+            own = column.of_run(part)
+            own = own.select(own.step <= budgets[part])
+            parts.append(own._replace(run=0 * own.run + chain[-1], step=own.step + before))
+            before += budgets[part]
+        curve = joined(parts)
+        return curve.select(np.diff(curve.step, append=np.iinfo(np.int64).max) > 0)
+
+    history = _Computed(
+        sweep.history, lambda column: joined([whole(column, chain) for chain in chains])
+    )
+    runs = [
+        replace(run, params={**run.params, "env_steps": str(sum(budgets[i] for i in chain))})
+        for run, chain in zip(sweep.runs, chains, strict=True)
+    ]
+    return replace(sweep, runs=runs, history=history)
+
+
+def counted(sweep: Sweep, kind: str) -> Sweep:
+    """The sweep with the environment steps that a measure of this kind counts."""
+    return with_pretraining(sweep) if kind == "auc_total" else sweep

@@ -31,8 +31,7 @@ from music_rllib.results.conditions import (
     whole_setting,
 )
 from music_rllib.results.data import RunRecord, Sweep
-from music_rllib.results.pretraining import counted
-from music_rllib.results.scores import Measure, Scores, first_result, measure_on, scores_of
+from music_rllib.results.scores import Measure, Scores, counted, first_result, measure_on, scores_of
 from music_rllib.results.statistics import Estimate
 
 MOST_CONDITIONS = 6
