@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -66,89 +67,53 @@ def between_q(claims: Sequence[Claim]) -> list[Claim]:
 
 
 def headline() -> str:
-    """Whether q = 1.5 is better than q = 1 anywhere; then a sentence per setting.
-
-    The sentences state the effect of q on each task, by the verdicts on the mean action.
-    """
-    settings: dict[str, list[Claim]] = {}
-    for sweep, study in complete_studies():
-        settings.setdefault(STUDIES[sweep.name], []).extend(between_q(study.planned))
+    """Whether q = 1.5 is better than q = 1 anywhere, and the number of each verdict."""
+    claims = [
+        (STUDIES[sweep.name], claim)
+        for sweep, study in complete_studies()
+        for claim in between_q(study.planned)
+    ]
+    asked = ("q = 1.5", "q = 1")
     better = [
         f"{claim.task} ({setting})"
-        for setting, claims in settings.items()
-        for claim in claims
-        if (claim.first, claim.second) == ("q = 1.5", "q = 1") and claim.verdict is Verdict.SUPERIOR
+        for setting, claim in claims
+        if (claim.first, claim.second) == asked and claim.verdict is Verdict.SUPERIOR
     ]
-    answer = "In no setting tested here is q = 1.5 better than q = 1."
+    answer = "In no study here is q = 1.5 better than q = 1."
     if better:
         answer = f"q = 1.5 is better than q = 1 on {' and '.join(better)}."
-    sentences = (f"{setting}: {_effects(claims)}." for setting, claims in settings.items())
-    return f"**{answer}** {' '.join(text[0].upper() + text[1:] for text in sentences)}"
-
-
-def _effects(claims: Sequence[Claim]) -> str:
-    """The effect of q on each task."""
-    tasks = dict.fromkeys(claim.task for claim in claims)
-    decided = list(filter(None, map(winner_and_loser, claims)))
-    better = [pair for pair in decided if pair[0] == "q = 1.5"]
-    parts = [f"q = 1.5 needs fewer steps than {loser} on {task}" for _, loser, task in better]
-    worse: dict[tuple[str, str], list[str]] = {}
-    for winner, loser, task in decided:
-        if winner != "q = 1.5":
-            worse.setdefault((loser, task), []).append(winner)
-    where = "any task here" if len(tasks) > 1 else next(iter(tasks))
-    if not better and not any(loser == "q = 1.5" for loser, _ in worse):
-        parts = [f"q = 1.5 beats neither q = 1 nor q = 2 on {where}"]
-    parts += [
-        f"{loser} needs more steps than {' and '.join(winners)} on {task}"
-        for (loser, task), winners in worse.items()
-    ]
-    for task in tasks:
-        verdicts = {claim.verdict for claim in claims if claim.task == task}
-        if verdicts == {Verdict.UNDECIDED}:
-            parts.append(f"{task} is open")
-        elif Verdict.EQUIVALENT in verdicts:
-            parts.append(_alike([claim for claim in claims if claim.task == task]))
-    return "; ".join(parts)
-
-
-def winner_and_loser(claim: Claim) -> tuple[str, str, str] | None:
-    """Better and worse condition of a decided comparison, and its task."""
-    if claim.verdict is Verdict.SUPERIOR:
-        return claim.first, claim.second, claim.task
-    return (claim.second, claim.first, claim.task) if claim.verdict is Verdict.WORSE else None
-
-
-def _alike(claims: Sequence[Claim]) -> str:
-    """The q that are equivalent on a task."""
-    alike = [claim for claim in claims if claim.verdict is Verdict.EQUIVALENT]
-    seeds = min(claim.contrast.seeds[0] for claim in claims)
-    pairs = " and ".join(f"{claim.first} to {claim.second}" for claim in alike)
-    single = f"{alike[0].first} and {alike[0].second}" if len(alike) == 1 else pairs
-    who = f"{'all three q' if len(alike) == len(claims) else single} are equivalent"
-    within = f"on {claims[0].task} {who} within {claims[0].margin:g}"
-    few = ", too few to exclude rare collapses" if seeds < SEEDS_FOR_COLLAPSES else ""
-    return f"{within} ({seeds} seeds{few})"
+    found = [claim for _, claim in claims]
+    decided = {claim.task for claim in found if claim.verdict is not Verdict.UNDECIDED}
+    undecided = [task for task in dict.fromkeys(c.task for c in found) if task not in decided]
+    open_tasks = f" Nothing is decided on {' and '.join(undecided)}." if undecided else ""
+    counts = _counts((claim, str(claim.verdict)) for claim in found)
+    return f"**{answer}** By the mean action, {counts}.{open_tasks}"
 
 
 def sampled_sentence() -> str:
-    """Comparisons of two q by the sampled policy whose CI excludes 0, in words."""
-    where: dict[tuple[str, str, str], list[str]] = {}
-    for sweep, study in complete_studies():
-        for claim in between_q(sampled(sweep, study)):
-            gap = claim.contrast.difference
-            if gap.lower > 0 or gap.upper < 0:
-                side = "above" if gap.value > 0 else "below"
-                where.setdefault((claim.first, side, claim.second), []).append(
-                    f"{claim.task} ({STUDIES[sweep.name]})"
-                )
-    parts = [
-        f"{first} is {side} {second} on {' and '.join(tasks)}"
-        for (first, side, second), tasks in where.items()
-    ]
+    """How many comparisons of two q by the sampled policy have a CI that excludes 0."""
+    counts = _counts(
+        (claim, "above" if gap.lower > 0 else "below" if gap.upper < 0 else "unclear")
+        for sweep, study in complete_studies()
+        for claim in between_q(sampled(sweep, study))
+        for gap in [claim.contrast.difference]
+    )
     return (
-        "For the sampled policy, these 95% intervals exclude 0 (exploratory, not adjusted): "
-        f"{'; '.join(parts) or 'none'}."
+        f"By the sampled policy, {counts}. Above and below mean that the 95% interval excludes 0 "
+        "(exploratory, not adjusted)."
+    )
+
+
+def _counts(results: Iterable[tuple[Claim, str]]) -> str:
+    """`in 6 studies, q = 1.5 against q = 1 is worse in 1, undecided in 3, equivalent in 2; ...`."""
+    of_pair: dict[tuple[str, str], Counter[str]] = {}
+    for claim, result in results:
+        of_pair.setdefault((claim.first, claim.second), Counter())[result] += 1
+    studies = max(counter.total() for counter in of_pair.values())
+    return f"in {studies} studies, " + "; ".join(
+        f"{first} against {second} is "
+        + ", ".join(f"{result} in {n}" for result, n in counter.items())
+        for (first, second), counter in of_pair.items()
     )
 
 

@@ -64,25 +64,27 @@ def test_pretraining_counts_towards_an_equal_total() -> None:
 
 
 @pytest.mark.parametrize(
-    ("verdicts", "sentence"),
+    ("verdicts", "answer", "end"),
     [
         (
             (Verdict.UNDECIDED, Verdict.UNDECIDED, Verdict.WORSE),
-            "q = 1.5 beats neither q = 1 nor q = 2 on FetchPush; "
-            "q = 2 needs more steps than q = 1 on FetchPush",
+            "In no study here is q = 1.5 better than q = 1.",
+            "",
         ),
         (
             (Verdict.SUPERIOR, Verdict.UNDECIDED, Verdict.UNDECIDED),
-            "q = 1.5 needs fewer steps than q = 1 on FetchPush",
+            "q = 1.5 is better than q = 1 on FetchPush (joint entropy, HER alone).",
+            "",
         ),
         (
             (Verdict.UNDECIDED, Verdict.UNDECIDED, Verdict.UNDECIDED),
-            "q = 1.5 beats neither q = 1 nor q = 2 on FetchPush; FetchPush is open",
+            "In no study here is q = 1.5 better than q = 1.",
+            " Nothing is decided on FetchPush.",
         ),
     ],
 )
 def test_the_first_sentence_follows_the_verdicts(
-    verdicts: tuple[Verdict, ...], sentence: str, monkeypatch: pytest.MonkeyPatch
+    verdicts: tuple[Verdict, ...], answer: str, end: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     runs = sweep()
     stages = {stage.name: stage.conditions[0] for stage in find_stages(runs)}
@@ -97,7 +99,9 @@ def test_the_first_sentence_follows_the_verdicts(
     monkeypatch.setattr(
         summary, "complete_studies", lambda: [(replace(runs, name="joint-her"), study)]
     )
-    answer = "In no setting tested here is q = 1.5 better than q = 1."
-    if verdicts[0] is Verdict.SUPERIOR:
-        answer = "q = 1.5 is better than q = 1 on FetchPush (joint entropy, HER alone)."
-    assert summary.headline() == f"**{answer}** Joint entropy, HER alone: {sentence}."
+    first, second, third = verdicts
+    counts = (
+        f"in 1 studies, q = 1.5 against q = 1 is {first} in 1; q = 2 against q = 1.5 is {second} "
+        f"in 1; q = 2 against q = 1 is {third} in 1"
+    )
+    assert summary.headline() == f"**{answer}** By the mean action, {counts}.{end}"
