@@ -115,12 +115,12 @@ def compared(x: pd.Series, y: pd.Series) -> Claim:
     }
 
 
-def decided(family: list[Claim], dropped: int = 0) -> list[Claim]:
+def decided(family: list[Claim]) -> list[Claim]:
     """Holm's method with Shaffer's multiplier; returns the comparisons with a remaining test."""
     tests = sorted((claim[kind], i, kind) for i, claim in enumerate(family) for kind in KINDS)
     left, highest = [set(KINDS) for _ in family], 0.0
     for p, i, kind in tests:
-        highest = max(highest, min(1.0, p * (dropped + sum(map(bool, left)))))
+        highest = max(highest, min(1.0, p * sum(map(bool, left))))
         family[i]["adjusted " + kind] = highest
         left[i].discard(kind)
     for claim in family:
