@@ -87,33 +87,29 @@ def headline() -> str:
     undecided = [task for task in dict.fromkeys(c.task for c in found) if task not in decided]
     open_tasks = f" Nothing is decided on {' and '.join(undecided)}." if undecided else ""
     counts = _counts((claim, str(claim.verdict)) for claim in found)
-    return f"**{answer}** By the mean action, {counts}.{open_tasks}"
+    return f"**{answer}** Verdicts on {counts}.{open_tasks}"
 
 
 def sampled_sentence() -> str:
     """How many comparisons of two q by the sampled policy have a CI that excludes 0."""
     counts = _counts(
-        (claim, "above" if gap.lower > 0 else "below" if gap.upper < 0 else "unclear")
+        (claim, "above 0" if gap.lower > 0 else "below 0" if gap.upper < 0 else "include 0")
         for sweep, study in complete_studies()
         for claim in between_q(sampled(sweep, study))
         for gap in [claim.contrast.difference]
     )
-    return (
-        f"By the sampled policy, {counts}. Above and below mean that the 95% interval excludes 0 "
-        "(exploratory, not adjusted)."
-    )
+    return f"95% intervals of the sampled policy (exploratory, not adjusted) for {counts}."
 
 
 def _counts(results: Iterable[tuple[Claim, str]]) -> str:
-    """`in 6 studies, q = 1.5 against q = 1 is worse in 1, undecided in 3, equivalent in 2; ...`."""
-    of_pair: dict[tuple[str, str], Counter[str]] = {}
+    """`q = 1.5 against q = 1: 3 undecided, 1 worse; ...`, for each q against q = 1."""
+    of_pair: dict[str, Counter[str]] = {}
     for claim, result in results:
-        of_pair.setdefault((claim.first, claim.second), Counter())[result] += 1
-    studies = max(counter.total() for counter in of_pair.values())
-    return f"in {studies} studies, " + "; ".join(
-        f"{first} against {second} is "
-        + ", ".join(f"{result} in {n}" for result, n in counter.items())
-        for (first, second), counter in of_pair.items()
+        if claim.second == "q = 1":
+            of_pair.setdefault(f"{claim.first} against q = 1", Counter())[result] += 1
+    return "; ".join(
+        f"{pair}: " + ", ".join(f"{n} {result}" for result, n in counter.most_common())
+        for pair, counter in of_pair.items()
     )
 
 

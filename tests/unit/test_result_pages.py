@@ -99,9 +99,5 @@ def test_the_first_sentence_follows_the_verdicts(
     monkeypatch.setattr(
         summary, "complete_studies", lambda: [(replace(runs, name="joint-her"), study)]
     )
-    first, second, third = verdicts
-    counts = (
-        f"in 1 studies, q = 1.5 against q = 1 is {first} in 1; q = 2 against q = 1.5 is {second} "
-        f"in 1; q = 2 against q = 1 is {third} in 1"
-    )
-    assert summary.headline() == f"**{answer}** By the mean action, {counts}.{end}"
+    counts = f"q = 1.5 against q = 1: 1 {verdicts[0]}; q = 2 against q = 1: 1 {verdicts[2]}"
+    assert summary.headline() == f"**{answer}** Verdicts on {counts}.{end}"
