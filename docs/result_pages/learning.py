@@ -25,6 +25,8 @@ from music_rllib.results.statistics import Array
 from music_rllib.results.study import study_of
 
 PRETRAINING = ("MUSIC-u (pretraining, no reward)", Style("#9a9a9a", "o"))
+NOT_IN_THE_PICTURE = ("equal-entropy",)
+"""Studies whose comparisons are all undecided; six subplots fill the picture."""
 SCRATCH = ("HER alone, q = 1", Style("#4d4d4d", "D", (6, 3)))
 (SUCCESS,) = (metric for metric in METRICS if metric.name == names.EVAL_SUCCESS)
 
@@ -70,11 +72,13 @@ def peers_figure(sweep: Sweep, figures: dict[str, bytes]) -> Iterator[str]:
 
 
 def overview() -> bytes:
-    """A PNG of all complete studies, the one with the most seeds first."""
+    """A PNG of the complete studies, the one with the most seeds first."""
     subplots: list[Subplot] = []
     entries: dict[str, Style] = {}
     studies = sorted(complete_studies(), key=lambda pair: -pair[1].planned[0].contrast.seeds[0])
     for sweep, study in studies:
+        if sweep.name in NOT_IN_THE_PICTURE:
+            continue
         legend = _legend(sweep)
         first = study.planned[0]
         curves = [_shifted(sweep, curve(sweep, c, first.task, SUCCESS.name)) for c in legend]

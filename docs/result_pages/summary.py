@@ -25,6 +25,7 @@ STUDIES = {
     "joint-her": JOINT,
     "claims-push": MUSIC,
     "claims-pick-and-place": MUSIC,
+    "pick-and-place-in-80000-steps": "q = 1, 80,000 steps in all",
     "claims-slide": MUSIC,
 }
 """Setting of each study; studies of one setting share a sentence."""
@@ -85,7 +86,9 @@ def headline() -> str:
     found = [claim for _, claim in claims]
     decided = {claim.task for claim in found if claim.verdict is not Verdict.UNDECIDED}
     undecided = [task for task in dict.fromkeys(c.task for c in found) if task not in decided]
-    open_tasks = f" Nothing is decided on {' and '.join(undecided)}." if undecided else ""
+    open_tasks = (
+        f" No comparison of q is decided on {' and '.join(undecided)}." if undecided else ""
+    )
     counts = _counts((claim, str(claim.verdict)) for claim in found)
     return f"**{answer}** Verdicts on {counts}.{open_tasks}"
 

@@ -79,7 +79,7 @@ def test_pretraining_counts_towards_an_equal_total() -> None:
         (
             (Verdict.UNDECIDED, Verdict.UNDECIDED, Verdict.UNDECIDED),
             "In no study here is q = 1.5 better than q = 1.",
-            " Nothing is decided on FetchPush.",
+            " No comparison of q is decided on FetchPush.",
         ),
     ],
 )

@@ -34,7 +34,7 @@ STUDIES = {  # export and compared stage
 }
 TOTALS = {"claims-pick-and-place": 200_000, "joint-music": 30_000}
 """Steps with pretraining at which MUSIC-r is compared with HER alone."""
-COUNTED = {"joint-music": 30_000, "equal-entropy": 30_000}
+COUNTED = {"joint-music": 30_000, "equal-entropy": 30_000, "pick-and-place-in-80000-steps": 80_000}
 """Steps of the studies whose metric counts the pretraining."""
 BETWEEN_Q = (("1.5", "1"), ("2", "1.5"), ("2", "1"))
 KINDS = ("p", "tost")
@@ -193,6 +193,15 @@ def test_every_row_of_the_summary() -> None:
                 for metric in (MEAN, SAMPLED)
             )
             expected.append((mean, in_words(mean, planned=False), other))
+        if study == "claims-pick-and-place":  # the next study compares no q
+            mean, other = (
+                compared(
+                    *(areas("pick-and-place-in-80000-steps", s, "1", m) for s in (stage, "her"))
+                )
+                for m in (MEAN, SAMPLED)
+            )
+            decided([mean])
+            expected.append((mean, in_words(mean, planned=True), other))
     found = [row[4:] for row in rows]
     assert found == [
         [text, in_words(other, planned=False), str(mean["seeds"])] for mean, text, other in expected
@@ -264,7 +273,10 @@ def outcomes(study: str, stage: str, q: str) -> list[str]:
 
 @pytest.mark.parametrize(("study", "stage"), STUDIES.values())
 def test_every_number_of_a_tasks_table(study: str, stage: str) -> None:
-    header, _, *rows = table(f"{study}-all-stages-success")
+    after, page = f"{study}-all-stages-success", PAGE
+    if study == "claims-push":
+        after, page = "## FetchPush\n", DETAILS
+    header, _, *rows = table(after, page)
     columns = [[line[at] for line in rows] for at in range(1, len(header))]
     expected = [outcomes(study, stage, q) for q in ("1", "1.5", "2")]
     if study == "claims-pick-and-place":
@@ -293,21 +305,29 @@ def test_the_verdicts_without_one_seed() -> None:
     assert re.findall(r"^(- q = .* cases)[;.]", DETAILS, re.MULTILINE) == expected
 
 
-def test_every_row_of_the_table_of_intrinsic_rewards() -> None:
-    """Each reward against hindsight alone; the plan has eight of them."""
-    study, total = "intrinsic-rewards", 20_000
-    header, _, her, *rows = table("## Intrinsic rewards on FetchPush", DETAILS)
+@pytest.mark.parametrize(
+    ("study", "total", "page"),
+    [
+        ("intrinsic-rewards", 20_000, DETAILS),
+        ("pick-and-place-in-80000-steps", 80_000, PAGE),
+    ],
+)
+def test_every_row_of_a_table_of_stages(study: str, total: int, page: str) -> None:
+    """Each planned stage against hindsight alone."""
+    after = {DETAILS: "## Intrinsic rewards on FetchPush", PAGE: f"{study}-all-stages-success"}
+    header, _, *lines = table(after[page], page)
     assert header[1:4] == ["verdict, difference", "area over all steps [95% CI]", header[3]]
-    stages = [row[0] for row in rows]
-    scores = {stage: areas_of_all_steps(study, stage, MEAN, total) for stage in ("her", *stages)}
-    claims = [compared(scores[stage], scores["her"]) for stage in stages]
-    assert len(claims) == 8
-    claims = decided(claims)
-    assert [row[1] for row in rows] == [in_words(claim, planned=True) for claim in claims]
-    for row in (her, *rows):
-        values = rate_interval(scores[row[0]].to_numpy(), np.inf)
+    rows = {row[0]: row for row in lines}
+    assert len(rows) == (9 if study == "intrinsic-rewards" else 2)
+    scores = {stage: areas_of_all_steps(study, stage, MEAN, total) for stage in rows}
+    stages = [stage for stage in rows if stage != "her"]
+    claims = decided([compared(scores[stage], scores["her"]) for stage in stages])
+    for stage, claim in zip(stages, claims, strict=True):
+        assert rows[stage][1] == in_words(claim, planned=True)
+    for stage, row in rows.items():
+        values = rate_interval(scores[stage].to_numpy(), np.inf)
         assert row[2] == "{} [{}, {}]".format(*map(two_decimals, values))
-        finals = [curve(study, run, MEAN)[1][-1] for run in runs(study, row[0]).run]
+        finals = [curve(study, run, MEAN)[1][-1] for run in runs(study, stage).run]
         assert row[3] == "{:.0%} [{:.0%}, {:.0%}]".format(*rate_interval(np.array(finals), 50))
         assert row[5] == str(len(finals))
 
