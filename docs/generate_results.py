@@ -8,7 +8,7 @@ generator replaces `{{ KIND NAME }}` by a table of the sweep NAME. If tune_confi
 this name, the table has all its runs that any export in docs/results/data has, whichever sweep
 trained them; otherwise it has the runs of the export docs/results/data/NAME. KIND is
 
-- without NAME, over the three studies of q: `headline`, `summary`, `sampled` or `robustness`;
+- without NAME, over the studies of `summary.STUDIES`: `headline`, `summary`, `sampled` or `robustness`;
 - for a planned study: `verdict` (with the hypothesis), `answer`, `outcomes` (with stages),
   `seeds`, `cells`, `figure` (with its name), `learning`, `arms`, `peers`, `equal-total`, `hours` or
   `progress`;

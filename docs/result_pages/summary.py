@@ -28,14 +28,12 @@ STUDIES = {
     "pick-and-place-in-80000-steps": "q = 1, 80,000 steps in all",
     "claims-slide": MUSIC,
 }
-"""Setting of each study; studies of one setting share a sentence."""
+"""Setting of each study."""
 PAPER = {
     ("FetchPush", "q = 1.5", "q = 1"): "Figure 4: faster",
     ("FetchPickAndPlace", "q = 1.5", "q = 1"): "Figure 5: better",
     ("FetchSlide", "q = 1.5", "q = 1"): "Figure 6: comparable; text: better",
 }
-SEEDS_FOR_COLLAPSES = 16
-"""Seeds that show a collapse of one in ten runs with 80% probability: 1 - 0.9^16 = 0.81."""
 BETWEEN_STAGES = "stage = "
 """Start of the labels of a comparison of two stages."""
 
