@@ -265,8 +265,8 @@ def report_at_end(opened: OpenSweep) -> str | None:
     It runs in a process of its own: whatever happens in it, the results of the sweep are kept.
 
     Returns:
-        A message with the paths of the page and its picture, or with the reason why there is no
-        report; None if `MUSIC_RLLIB_REPORT=off` is set.
+        The answer and the paths of the page and its picture, or the reason why there is no report;
+        None if `MUSIC_RLLIB_REPORT=off` is set.
     """
     if os.environ.get(names.VARIABLE_REPORT, "").lower() in {"off", "0", "no", "false"}:
         return None
@@ -292,12 +292,11 @@ def report_at_end(opened: OpenSweep) -> str | None:
     except (OSError, subprocess.TimeoutExpired) as error:
         reason = redact(str(error))
     else:
-        marks = ("Report: ", "Picture: ")
-        made = [line for line in done.stdout.splitlines() if line.startswith(marks)]
+        made = [s for s in done.stdout.splitlines() if not s.startswith(("missing: ", "Attached "))]
         errors = done.stderr.strip().splitlines()
         if "RAY_JOB_CONFIG_JSON_ENV_VAR" in environment or remote:
             made = elsewhere(done.stdout, opened.location.place)
-        if made:  # even if it could not be attached, or if runs are damaged
+        if any(s.startswith("Report: ") for s in made):  # even if not attached, or runs are damaged
             return "\n".join(made if done.returncode == 0 else [*made, *errors[-1:]])
         reason = errors[-1] if errors else f"it ended with exit code {done.returncode}"
     return f"No report: {reason}. Make it with: music-rllib report {opened.location.place}"
@@ -305,11 +304,13 @@ def report_at_end(opened: OpenSweep) -> str | None:
 
 def elsewhere(output: str, sweep: str) -> list[str]:
     """Lines of the report's `output` for a user who may read it on another machine."""
-    lines = [line for line in output.splitlines() if re.match("Attached .*: https?:", line)]
+    lines = []
     for line in output.splitlines():
         if line.startswith("Report: "):
             lines += [
                 f"On your machine: music-rllib report {sweep}",
                 f"{line} (on {gethostname()})",
             ]
+        elif not re.match("missing: |Picture: |Attached (?!.*: https?:)", line):
+            lines.append(line)
     return lines

@@ -988,15 +988,14 @@ def test_reused_runs_count_as_finished_in_the_lines_of_stages(tmp_path: Path, st
 def test_a_report_made_on_another_machine_can_be_opened_on_this_one() -> None:
     page = "http://mlflow:5000/#/experiments/1/runs/2"
     output = (
-        f"missing: x\nReport: /head/r/index.html\nPicture: /head/a.png\nAttached to MLflow: {page}"
+        "missing: x\nq = 2 against q = 1: worse.\n"
+        f"Report: /head/r/index.html\nPicture: /head/a.png\nAttached to MLflow: {page}"
     )
-    lines = execution.elsewhere(output, "s3://bucket/sweeps/s")
-    assert lines[:2] == [
-        f"Attached to MLflow: {page}",
-        "On your machine: music-rllib report s3://bucket/sweeps/s",
-    ]
-    assert lines[2].startswith("Report: /head/r/index.html (on ")
-    assert execution.elsewhere("error: no", "s3://b/s") == []
+    answer, command, report, attached = execution.elsewhere(output, "s3://bucket/sweeps/s")
+    assert answer == "q = 2 against q = 1: worse."
+    assert command == "On your machine: music-rllib report s3://bucket/sweeps/s"
+    assert report.startswith("Report: /head/r/index.html (on ")
+    assert attached == f"Attached to MLflow: {page}"
 
 
 def test_slurm_writes_a_job_array_and_submits_it(
