@@ -8,7 +8,8 @@ generator replaces `{{ KIND NAME }}` by a table of the sweep NAME. If tune_confi
 this name, the table has all its runs that any export in docs/results/data has, whichever sweep
 trained them; otherwise it has the runs of the export docs/results/data/NAME. KIND is
 
-- without NAME, over the studies of `summary.STUDIES`: `headline`, `summary`, `sampled` or `robustness`;
+- without NAME, over the studies of `summary.STUDIES`: `headline`, `summary`, `sampled` or
+  `robustness`;
 - for a planned study: `verdict` (with the hypothesis), `answer`, `outcomes` (with stages),
   `seeds`, `cells`, `figure` (with its name), `learning`, `arms`, `peers`, `equal-total`, `hours` or
   `progress`;
@@ -46,6 +47,8 @@ from docs.result_pages.summary import (
     summary_table,
 )
 from docs.result_pages.totals import arms_table, totals_table
+from music_rllib.report.figures.choice import Drawing
+from music_rllib.report.figures.draw import files
 
 FOLDER = Path(__file__).parent
 PAGES = {"results.md": "page.md", "lab/claims.md": "claims.md", "lab/appendix.md": "appendix.md"}
@@ -58,7 +61,7 @@ NOT_RUN = "*Not run yet.*"
 
 def main() -> int:
     """Write the pages, or check them."""
-    figures: dict[str, bytes] = {}
+    figures: dict[str, Drawing] = {}
     texts = {FOLDER / name: page(name, figures) for name in PAGES}
     if "--check" in sys.argv[1:]:
         stale = [
@@ -75,13 +78,13 @@ def main() -> int:
     FIGURES.mkdir(parents=True, exist_ok=True)
     for old in FIGURES.glob("*.svg"):
         old.unlink()
-    for name, content in figures.items():
-        (FIGURES / name).write_bytes(content)
+    for name, drawing in figures.items():
+        (FIGURES / name).write_bytes(files(drawing.subplots, drawing.legend)[".svg"])
     PICTURE.write_bytes(overview())
     return 0
 
 
-def page(name: str, figures: dict[str, bytes]) -> str:
+def page(name: str, figures: dict[str, Drawing]) -> str:
     """A page with its tables; adds its figures to `figures`."""
     words: dict[str, Callable[..., str]] = {
         "headline": headline,

@@ -31,7 +31,7 @@ SCRATCH = ("HER alone, q = 1", Style("#4d4d4d", "D", (6, 3)))
 (SUCCESS,) = (metric for metric in METRICS if metric.name == names.EVAL_SUCCESS)
 
 
-def learning_figure(sweep: Sweep, figures: dict[str, bytes]) -> Iterator[str]:
+def learning_figure(sweep: Sweep, figures: dict[str, Drawing]) -> Iterator[str]:
     """The mean action and the sampled policy side by side."""
     (task,) = {run.task for run in sweep.runs}
     legend = _legend(sweep)
@@ -50,7 +50,7 @@ def learning_figure(sweep: Sweep, figures: dict[str, bytes]) -> Iterator[str]:
     yield from figure(sweep, drawing, figures)
 
 
-def peers_figure(sweep: Sweep, figures: dict[str, bytes]) -> Iterator[str]:
+def peers_figure(sweep: Sweep, figures: dict[str, Drawing]) -> Iterator[str]:
     """A subplot for each stage that a plan compares with another one; none until it is complete."""
     if not is_complete(sweep):
         return

@@ -12,7 +12,7 @@ from docs.result_pages.figures import figure
 from docs.result_pages.runs import last_value
 from docs.result_pages.words import percent, rate_cells, row, rule, spread, wait_text
 from music_rllib import names
-from music_rllib.report.figures.choice import slug, stage_drawings, study_drawings
+from music_rllib.report.figures.choice import Drawing, slug, stage_drawings, study_drawings
 from music_rllib.results import statistics as st
 from music_rllib.results.analysis import THRESHOLDS, StageAnalysis, analyse
 from music_rllib.results.analysis_plan import analysis_plan
@@ -137,7 +137,7 @@ def cell_text(sweep: Sweep, mean: Mean | None) -> str:
     return f"{np.mean(scores):.2f}{apart}, {entropy:.1f} nats ({len(scores)})"
 
 
-def named_figure(sweep: Sweep, name: str, figures: dict[str, bytes]) -> Iterator[str]:
+def named_figure(sweep: Sweep, name: str, figures: dict[str, Drawing]) -> Iterator[str]:
     """A figure of the compared stage.
 
     Raises:

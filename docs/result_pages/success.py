@@ -6,13 +6,18 @@ from collections.abc import Iterator, Sequence
 
 from docs.result_pages.figures import figure
 from docs.result_pages.words import THRESHOLD, rate_cells, row, rule, wait_text
-from music_rllib.report.figures.choice import PRIMARY, drawings_of_stages, stage_drawings
+from music_rllib.report.figures.choice import (
+    PRIMARY,
+    Drawing,
+    drawings_of_stages,
+    stage_drawings,
+)
 from music_rllib.results.analysis import StageAnalysis, analyse, time_to_threshold
 from music_rllib.results.conditions import Condition, find_stages
 from music_rllib.results.data import Sweep
 
 
-def success(sweep: Sweep, figures: dict[str, bytes], stages: Sequence[str] = ()) -> Iterator[str]:
+def success(sweep: Sweep, figures: dict[str, Drawing], stages: Sequence[str] = ()) -> Iterator[str]:
     """For each stage: final success, steps to the threshold, and curves."""
     for analysis in analyse(sweep):
         if stages and analysis.stage.name not in stages:
@@ -83,7 +88,7 @@ def _times(sweep: Sweep, condition: Condition, task: str) -> tuple[str, str]:
     return wait_text(found.median) if found.reached.any() else "not reached", each
 
 
-def curves(sweep: Sweep, analysis: StageAnalysis, figures: dict[str, bytes]) -> Iterator[str]:
+def curves(sweep: Sweep, analysis: StageAnalysis, figures: dict[str, Drawing]) -> Iterator[str]:
     """The figure of success rates."""
     for drawing in stage_drawings(sweep, analysis):
         if drawing.title == "Success rate":
@@ -91,7 +96,7 @@ def curves(sweep: Sweep, analysis: StageAnalysis, figures: dict[str, bytes]) -> 
             yield ""
 
 
-def stage_curves(sweep: Sweep, figures: dict[str, bytes], stages: Sequence[str]) -> Iterator[str]:
+def stage_curves(sweep: Sweep, figures: dict[str, Drawing], stages: Sequence[str]) -> Iterator[str]:
     """The figure of success rates of several stages, side by side."""
     for drawing in drawings_of_stages(
         sweep, [stage for stage in find_stages(sweep) if stage.name in stages]
