@@ -7,6 +7,7 @@ of 50 evaluation episodes succeed, or after SECONDS of CPU time. Evaluations are
 from __future__ import annotations
 
 import functools
+import importlib
 import json
 import math
 import os
@@ -35,7 +36,7 @@ FACTOR = 5.0
 
 def rows(repeats: int) -> Iterator[Row]:
     """Ours against others with hindsight, for `repeats` seeds."""
-    if not is_installed("sbx"):
+    if not (is_installed("sbx") and is_installed("sb3_contrib")):
         return
     others = [name for name in PROGRAMS if name != "ours"]
     ratios: dict[str, list[float]] = {name: [] for name in others}
@@ -104,14 +105,13 @@ def ours(seed: int) -> tuple[Advance, Evaluate]:
     return advance, lambda: run.evaluate()[names.EVAL_SUCCESS]
 
 
-def sbx_tqc(seed: int, *, zoo: bool) -> tuple[Advance, Evaluate]:
-    """SBX's TQC with the HerReplayBuffer.
+def tqc(seed: int, *, library: str, zoo: bool) -> tuple[Advance, Evaluate]:
+    """TQC of SBX or of Stable-Baselines3 (`sb3_contrib`) with the HerReplayBuffer.
 
     `zoo`: with the settings of RL Baselines3 Zoo for FetchPush; otherwise with our networks, batch,
     and updates of four episodes in one compiled call.
     """
     import gymnasium as gym
-    from sbx import TQC
     from stable_baselines3 import HerReplayBuffer
     from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -127,7 +127,7 @@ def sbx_tqc(seed: int, *, zoo: bool) -> tuple[Advance, Evaluate]:
             "train_freq": (50, "step"), "gradient_steps": 200,
         }
     )  # fmt: skip
-    model = TQC(
+    model = importlib.import_module(library).TQC(
         "MultiInputPolicy",
         DummyVecEnv([functools.partial(gym.make, ENV_ID)] * environments),
         replay_buffer_class=HerReplayBuffer,
@@ -158,8 +158,10 @@ def sbx_tqc(seed: int, *, zoo: bool) -> tuple[Advance, Evaluate]:
 
 PROGRAMS: dict[str, Callable[[int], tuple[Advance, Evaluate]]] = {
     "ours": ours,
-    "SBX TQC+HER, Zoo's settings": functools.partial(sbx_tqc, zoo=True),
-    "SBX TQC+HER, our networks": functools.partial(sbx_tqc, zoo=False),
+    "SBX TQC+HER, Zoo's settings": functools.partial(tqc, library="sbx", zoo=True),
+    "SBX TQC+HER, our networks": functools.partial(tqc, library="sbx", zoo=False),
+    "SB3 TQC+HER, Zoo's settings": functools.partial(tqc, library="sb3_contrib", zoo=True),
+    "SB3 TQC+HER, our networks": functools.partial(tqc, library="sb3_contrib", zoo=False),
 }
 
 
