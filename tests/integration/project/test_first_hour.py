@@ -44,7 +44,7 @@ EXPECTED = re.compile(
     r"\[ *\d+:\d\d\] (q=|starting a local Ray$|best so far: (train )?q = )"
     r"|(stage|run|train|q=\S+)[ :/]|  |Sweep |Results |Storage: |3 runs, |"
     r"Report: |Picture: |Compare in MLflow: |Open MLflow's pages with: "
-    r"|No comparison was planned|q = |Metric: |Seeds: |Control: "
+    r"|No comparison was planned|q = |Metric: |Seeds: |Control: |All conditions |The standard "
 )
 """Lines that a sweep without problems prints."""
 
