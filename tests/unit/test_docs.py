@@ -111,6 +111,7 @@ def test_every_page_is_on_the_documentation_site() -> None:
         "joint_music",
         "equal_entropy",
         "equal_entropy_fixed",
+        "joint_pick",
     ],
 )
 def test_the_claims_and_their_sweeps_have_the_same_plan(study: str) -> None:
