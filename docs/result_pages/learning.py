@@ -25,8 +25,8 @@ from music_rllib.results.statistics import Array
 from music_rllib.results.study import study_of
 
 PRETRAINING = ("MUSIC-u (pretraining, no reward)", Style("#9a9a9a", "o"))
-NOT_IN_THE_PICTURE = ("equal-entropy",)
-"""Studies whose comparisons are all undecided; six subplots fill the picture."""
+NOT_IN_THE_PICTURE = ("equal-entropy", "claims-pick-and-place")
+"""Studies that decide nothing about q, on tasks that others show; six subplots fill the picture."""
 SCRATCH = ("HER alone, q = 1", Style("#4d4d4d", "D", (6, 3)))
 (SUCCESS,) = (metric for metric in METRICS if metric.name == names.EVAL_SUCCESS)
 

@@ -24,8 +24,9 @@ STUDIES = {
     "equal-entropy": "joint entropy at 1.5 nats, MUSIC-r",
     "joint-her": JOINT,
     "claims-push": MUSIC,
-    "claims-pick-and-place": MUSIC,
+    "joint-pick": "joint entropy, MUSIC-r",
     "pick-and-place-in-80000-steps": "q = 1, 80,000 steps in all",
+    "claims-pick-and-place": MUSIC,
     "claims-slide": MUSIC,
 }
 """Setting of each study."""

@@ -29,13 +29,25 @@ STUDIES = {  # export and compared stage
     ("FetchPush", "joint entropy at 1.5 nats, MUSIC-r"): ("equal-entropy", "music-r"),
     ("FetchPush", JOINT): ("joint-her", "her"),
     ("FetchPush", MUSIC): ("claims-push", "music-r"),
+    ("FetchPickAndPlace", "joint entropy, MUSIC-r"): ("joint-pick", "music-r"),
     ("FetchPickAndPlace", MUSIC): ("claims-pick-and-place", "music-r"),
     ("FetchSlide", MUSIC): ("claims-slide", "music-r"),
 }
 TOTALS = {"claims-pick-and-place": 200_000, "joint-music": 30_000}
 """Steps with pretraining at which MUSIC-r is compared with HER alone."""
-COUNTED = {"joint-music": 30_000, "equal-entropy": 30_000, "pick-and-place-in-80000-steps": 80_000}
+COUNTED = {
+    "joint-music": 30_000,
+    "equal-entropy": 30_000,
+    "joint-pick": 80_000,
+    "pick-and-place-in-80000-steps": 80_000,
+}
 """Steps of the studies whose metric counts the pretraining."""
+IN_DETAIL = {
+    "joint-her": "## FetchPush in the joint form, HER alone\n",
+    "claims-push": "## FetchPush\n",
+    "claims-pick-and-place": "## FetchPickAndPlace\n",
+}
+"""Studies whose tables are on the page of details: the headings before them."""
 BETWEEN_Q = (("1.5", "1"), ("2", "1.5"), ("2", "1"))
 KINDS = ("p", "tost")
 Claim = dict[str, Any]
@@ -193,7 +205,7 @@ def test_every_row_of_the_summary() -> None:
                 for metric in (MEAN, SAMPLED)
             )
             expected.append((mean, in_words(mean, planned=False), other))
-        if study == "claims-pick-and-place":  # the next study compares no q
+        if study == "joint-pick":  # the next study compares no q
             mean, other = (
                 compared(
                     *(areas("pick-and-place-in-80000-steps", s, "1", m) for s in (stage, "her"))
@@ -274,8 +286,8 @@ def outcomes(study: str, stage: str, q: str) -> list[str]:
 @pytest.mark.parametrize(("study", "stage"), STUDIES.values())
 def test_every_number_of_a_tasks_table(study: str, stage: str) -> None:
     after, page = f"{study}-all-stages-success", PAGE
-    if study == "claims-push":
-        after, page = "## FetchPush\n", DETAILS
+    if study in IN_DETAIL:
+        after, page = IN_DETAIL[study], DETAILS
     header, _, *rows = table(after, page)
     columns = [[line[at] for line in rows] for at in range(1, len(header))]
     expected = [outcomes(study, stage, q) for q in ("1", "1.5", "2")]
