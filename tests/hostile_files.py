@@ -595,8 +595,9 @@ CORPUS: dict[str, Hostile] = {
         _export("metrics.parquet", _nulls(1000, 1000)), "run must have a value in each row"
     ),
 }
-SECONDS, MEGABYTES = 1.0, 300
-"""Processor time and memory that a refusal may need in addition to its program's own."""
+SECONDS, MEGABYTES = 5.0, 300
+"""Processor time and memory that a refusal may need in addition to its program's own. It needs less
+than a second on an idle machine; a bomb that is not refused needs minutes."""
 PATIENCE = 60
 """Seconds on a clock, for a busy machine."""
 

@@ -34,7 +34,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]
 
 @pytest.mark.parametrize("name", CORPUS)
 def test_a_hostile_file_is_refused(found: dict[str, dict[str, Any]], name: str) -> None:
-    """Exit code 2 and a message, within a second and 300 MB."""
+    """Exit code 2 and a message, within 5 s of processor time and 300 MB."""
     result = found[name]
     assert CORPUS[name].said in result["said"]
     assert "Traceback" not in result["said"]
