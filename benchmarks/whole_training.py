@@ -28,7 +28,7 @@ OTHERS: dict[str, str] = {
 }
 """Programs to compare with, and the package that each needs."""
 SETTINGS: dict[tuple[int, float], dict[str, float | None]] = {
-    (128, 0.4): {"RLlib SAC, same networks": 15.0, "SB3 SAC+HER": 3.0, "SBX SAC+HER": 1.3},
+    (128, 0.4): {"RLlib SAC, same networks": 15.0, "SB3 SAC+HER": 2.5, "SBX SAC+HER": 1.3},
     (128, 1.0): {"SB3 SAC+HER": None, "SBX SAC+HER": None},
     (256, 0.4): {"RLlib SAC, same networks": None, "SB3 SAC+HER": 1.7, "SBX SAC+HER": None},
     (256, 1.0): {
