@@ -8,6 +8,7 @@ line of JSON: the environment steps and the elapsed seconds.
 from __future__ import annotations
 
 import functools
+import importlib
 import json
 import sys
 import time
@@ -23,16 +24,24 @@ WARM_UP = 1_000
 BATCH = 256
 ENVIRONMENTS = 4
 """Sub-environments of the programs that are faster with several."""
+OWN_TQC: dict[str, Any] = {
+    "bootstrap": "critics",
+    "policy_critic": "mean",
+    "quantiles": 25,
+    "dropped_quantiles": 2,
+}
+"""Settings of TQC, with two critics like the default of both other libraries."""
 
 
-def ours(width: int, ratio: float) -> Callable[[], int]:
-    """TAC with HER at q = 1 (SAC)."""
+def ours(width: int, ratio: float, *, tqc: bool = False) -> Callable[[], int]:
+    """TAC with HER at q = 1 (SAC); `tqc`: with its critics of quantiles."""
     from music_rllib import TACConfig
 
     config = TACConfig().environment(ENV_ID)
     config.env_runners(num_envs_per_env_runner=ENVIRONMENTS)
     config.training(
         random_steps=WARM_UP, hidden_sizes=[width] * 3, batch_size=BATCH, replay_ratio=ratio,
+        **(OWN_TQC if tqc else {}),
     )  # fmt: skip
     config.replay(hindsight_k=4.0).reporting(min_sample_timesteps_per_iteration=1)
     config.debugging(seed=0)
@@ -87,16 +96,17 @@ def rllib_sac(width: int, ratio: float, *, plain: bool = True) -> Callable[[], i
     return some_more
 
 
-def sb3_sac(width: int, ratio: float) -> Callable[[], int]:
-    """Stable-Baselines3's SAC with its HerReplayBuffer."""
+def sb3(width: int, ratio: float, *, algorithm: str) -> Callable[[], int]:
+    """SAC of Stable-Baselines3 or TQC of its contributions, with its HerReplayBuffer."""
     import gymnasium as gym
-    from stable_baselines3 import SAC, HerReplayBuffer
+    from stable_baselines3 import HerReplayBuffer
 
     from music_rllib.envs.make import make_env
 
     make_env(ENV_ID).close()  # registers the robotics tasks
     train_freq, gradient_steps = OFTEN[ratio]
-    model = SAC(
+    library = {"SAC": "stable_baselines3", "TQC": "sb3_contrib"}[algorithm]
+    model = getattr(importlib.import_module(library), algorithm)(
         "MultiInputPolicy",
         gym.make(ENV_ID),
         replay_buffer_class=HerReplayBuffer,
@@ -118,13 +128,12 @@ def sb3_sac(width: int, ratio: float) -> Callable[[], int]:
     return some_more
 
 
-def sbx_sac(width: int, ratio: float) -> Callable[[], int]:
-    """SAC with HerReplayBuffer of SBX, which is Stable-Baselines3 in JAX.
+def sbx(width: int, ratio: float, *, algorithm: str) -> Callable[[], int]:
+    """SAC or TQC with HerReplayBuffer of SBX, which is Stable-Baselines3 in JAX.
 
     It compiles all updates of a call into one, so a call has those of four episodes, as ours does.
     """
     import gymnasium as gym
-    from sbx import SAC
     from stable_baselines3 import HerReplayBuffer
     from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -132,7 +141,7 @@ def sbx_sac(width: int, ratio: float) -> Callable[[], int]:
 
     make_env(ENV_ID).close()  # registers the robotics tasks
     steps = ENVIRONMENTS * 50
-    model = SAC(
+    model = getattr(importlib.import_module("sbx"), algorithm)(
         "MultiInputPolicy",
         DummyVecEnv([functools.partial(gym.make, ENV_ID)] * ENVIRONMENTS),
         replay_buffer_class=HerReplayBuffer,
@@ -159,8 +168,11 @@ PEERS: dict[str, Callable[[int, float], Callable[[], int]]] = {
     "ours": ours,
     "RLlib SAC": functools.partial(rllib_sac, plain=False),
     "RLlib SAC, same networks": rllib_sac,
-    "SB3 SAC+HER": sb3_sac,
-    "SBX SAC+HER": sbx_sac,
+    "SB3 SAC+HER": functools.partial(sb3, algorithm="SAC"),
+    "SBX SAC+HER": functools.partial(sbx, algorithm="SAC"),
+    "ours, TQC": functools.partial(ours, tqc=True),
+    "SB3 TQC+HER": functools.partial(sb3, algorithm="TQC"),
+    "SBX TQC+HER": functools.partial(sbx, algorithm="TQC"),
 }
 
 

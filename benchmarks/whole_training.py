@@ -25,17 +25,20 @@ OTHERS: dict[str, str] = {
     "RLlib SAC, same networks": "ray",
     "SB3 SAC+HER": "stable_baselines3",
     "SBX SAC+HER": "sbx",
+    "SB3 TQC+HER": "sb3_contrib",
+    "SBX TQC+HER": "sbx",
 }
 """Programs to compare with, and the package that each needs."""
-SETTINGS: dict[tuple[int, float], dict[str, float | None]] = {
-    (128, 0.4): {"RLlib SAC, same networks": 15.0, "SB3 SAC+HER": 2.5, "SBX SAC+HER": 1.3},
-    (128, 1.0): {"SB3 SAC+HER": None, "SBX SAC+HER": None},
-    (256, 0.4): {"RLlib SAC, same networks": None, "SB3 SAC+HER": 1.7, "SBX SAC+HER": None},
-    (256, 1.0): {
+SETTINGS: dict[tuple[str, int, float], dict[str, float | None]] = {
+    ("ours", 128, 0.4): {"RLlib SAC, same networks": 15.0, "SB3 SAC+HER": 2.5, "SBX SAC+HER": 1.3},
+    ("ours, TQC", 128, 0.4): {"SB3 TQC+HER": 2.5, "SBX TQC+HER": 1.3},
+    ("ours", 128, 1.0): {"SB3 SAC+HER": None, "SBX SAC+HER": None},
+    ("ours", 256, 0.4): {"RLlib SAC, same networks": None, "SB3 SAC+HER": 1.7, "SBX SAC+HER": None},
+    ("ours", 256, 1.0): {
         "RLlib SAC": None, "RLlib SAC, same networks": 5.0, "SB3 SAC+HER": 1.7, "SBX SAC+HER": None,
     },
 }  # fmt: skip
-"""Width of the three layers and replay ratio (first those of preset `small`), and the targets."""
+"""Our program, width of the three layers and replay ratio (`small` first), and the targets."""
 
 
 class Peer:
@@ -91,13 +94,13 @@ class Peer:
 
 def rows(repeats: int) -> Iterator[Row]:
     """Speeds at equal networks, batch and replay ratio; programs of a setting take turns."""
-    for (width, ratio), targets in SETTINGS.items():
-        names = ["ours", *(name for name in targets if is_installed(OTHERS[name]))]
-        what = f"3 x {width}, replay ratio {ratio:g}"
+    for (ours, width, ratio), targets in SETTINGS.items():
+        names = [ours, *(name for name in targets if is_installed(OTHERS[name]))]
+        what = f"3 x {width}, replay ratio {ratio:g}{ours.removeprefix('ours')}"
         print(f"  {what}: {', '.join(names)}", file=sys.stderr, flush=True)
         taken = _in_turns(names, width, ratio, repeats)
         for name in names[1:]:
-            yield _row(what, taken["ours"], taken[name], f"{name} (speed)", targets[name])
+            yield _row(what, taken[ours], taken[name], f"{name} (speed)", targets[name])
 
 
 def _in_turns(names: list[str], width: int, ratio: float, repeats: int) -> dict[str, list[Taken]]:
