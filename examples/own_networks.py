@@ -36,5 +36,5 @@ class OwnNetworks(TACModule):
 
 spec = RLModuleSpec(module_class=OwnNetworks, model_config={"width": 32})
 config = TACConfig().environment("Pendulum-v1").rl_module(rl_module_spec=spec)
-algo = config.training(lr=1e-3, replay_ratio=0.5, alpha=0.2).debugging(seed=0).build_algo()
-print([round(algo.train()["env_runners"]["episode_return_mean"]) for _ in range(8)])
+algo = config.training(lr=2e-3, replay_ratio=0.5, alpha=0.2).debugging(seed=0).build_algo()
+print([round(algo.train()["env_runners"]["episode_return_mean"]) for _ in range(6)])
