@@ -37,7 +37,7 @@ GROUPS = {
 }
 EXAMPLES = """\
 examples:
-  python -m benchmarks                       the whole table, more than an hour
+  python -m benchmarks                       the whole table, several hours
   python -m benchmarks step environment      two groups of it
   python -m benchmarks --repeats 9 step      more turns
   BENCH_RUNS=12 python -m benchmarks warm    12 runs, not 60, in warm and in new processes
