@@ -111,14 +111,10 @@ class IntrinsicReward(nn.Module, ABC):
             learning: whether the bonuses count for the scale.
 
         Raises:
-            ValueError: `bonus` returned another shape, or numbers that are negative or not finite.
+            ValueError: `bonus` returned something else, or numbers that are negative or not finite.
         """
         bonus = self.bonus(batch)
-        if bonus.shape != batch.states.shape[:1]:
-            raise ValueError(
-                f"{type(self).__name__}.bonus must return one number for each transition, of shape "
-                f"{tuple(batch.states.shape[:1])}, got shape {tuple(bonus.shape)}"
-            )
+        self.check_result("bonus", bonus, (len(batch.states),))
         wrong = bonus[~((bonus >= 0.0) & (bonus < torch.inf))]
         if len(wrong):
             rule = f"{type(self).__name__}.bonus must return finite numbers >= 0"
@@ -131,6 +127,17 @@ class IntrinsicReward(nn.Module, ABC):
         scale = 2.0 * (self.sums[1] / self.sums[0].clamp(min=1.0)).sqrt()
         scale = scale.clamp(min=max(self.smallest_scale, 1e-12)).to(bonus)
         return (bonus / scale).clamp(0.0, 1.0) - 1.0, bonus
+
+    def check_result(self, method: str, found: object, shape: tuple[int, ...]) -> None:
+        """Raise ValueError if a method's result is no tensor of floats of this shape."""
+        if isinstance(found, Tensor):
+            if found.is_floating_point() and found.shape == shape:
+                return
+            kind = f"one of {found.dtype} and {tuple(found.shape)}"
+        else:
+            kind = type(found).__name__
+        rule = f"{type(self).__name__}.{method} must return a tensor of floats and of shape {shape}"
+        raise ValueError(f"{rule}, got {kind}")
 
 
 # -- parts of networks ---------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib
 import inspect
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -69,12 +69,17 @@ def make_reward(settings: IntrinsicSettings, sizes: Sizes, seed: int) -> Intrins
     kind = checked_class(settings)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        return kind(sizes, **settings.settings)
+        reward = kind(sizes, **settings.settings)
+    if getattr(reward, "sums", None) is None:
+        raise ValueError(f"{settings.reward} must call super().__init__(sizes) in its __init__")
+    return reward
 
 
 PERIOD = 4
 """Updates of the policy for each step of a reward's networks: it learns from a quarter of the
 minibatches, as RND does with many environments, and costs less than 40% of a small update."""
+
+_RESERVED = (names.INTRINSIC_REWARD, names.INTRINSIC_BONUS)
 
 
 class RewardLearner:
@@ -112,8 +117,8 @@ class RewardLearner:
             arrays = (episode.frames[:, :width], episode.actions)
             with torch.no_grad():
                 values = self.reward.of_episode(*(torch.tensor(a, device=device) for a in arrays))
-            assert values is not None
-            found.append(values.cpu().numpy())
+            self.reward.check_result("of_episode", values, (len(episode),))
+            found.append(cast("Tensor", values).cpu().numpy())
         return found
 
     def observe(self, batch: Batch, episodes: Sequence[Trajectory]) -> Tensor:
@@ -148,11 +153,29 @@ class RewardLearner:
             metrics[names.INTRINSIC_LOSS] = torch.stack(losses)
         return found, metrics
 
+    def metrics(self) -> dict[str, float]:
+        """The reward's own measures since the last call.
+
+        Raises:
+            ValueError: A name is not one of an intrinsic reward, so that it could replace another.
+        """
+        found = self.reward.metrics()
+        for name in found:
+            if not name.startswith("intrinsic/") or name in _RESERVED:
+                rule = "must begin with intrinsic/ and not be " + " or ".join(_RESERVED)
+                kind = type(self.reward).__name__
+                raise ValueError(f"names in {kind}.metrics {rule}, got {name!r}")
+        return found
+
     def _step(self, batch: Batch, adam: FusedAdam) -> None:
         with torch.enable_grad():
             loss = self.reward.loss(batch)
         if loss is None:
             return
+        self.reward.check_result("loss", loss, ())
+        if not loss.requires_grad:
+            name = type(self.reward).__name__
+            raise ValueError(f"{name}.loss must depend on the reward's parameters without detach()")
         gradients = torch.autograd.grad(loss, self._parameters, allow_unused=True)
         for parameter, gradient in zip(self._parameters, gradients, strict=True):
             parameter.grad = gradient

@@ -327,7 +327,7 @@ class TACLearner(TorchLearner):
             means |= {names.POLICY_LOSS: float(losses.mean())} if any(improving) else {}
         measured = {**means, **self._now.metrics(), **self._music.metrics(), names.ALPHA: alpha}
         if self.bonus is not None:
-            measured |= self.bonus.reward.metrics()
+            measured |= self.bonus.metrics()
         for key, value in measured.items():
             log((DEFAULT_MODULE_ID, key), value, window=1)
         log((ALL_MODULES, GRAD_UPDATES), self._grad_updates, window=1)

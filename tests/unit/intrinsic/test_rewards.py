@@ -6,14 +6,16 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from music_rllib.intrinsic.interface import Batch, IntrinsicReward, Sizes
 from music_rllib.intrinsic.novelty import E3B
-from music_rllib.intrinsic.relabeling import RewardLearner, make_reward, reward_class
+from music_rllib.intrinsic.relabeling import RewardLearner, make_reward
 from music_rllib.intrinsic.settings import BUILT_IN, SETTINGS, IntrinsicSettings
+from music_rllib.replay.trajectories import Trajectory
 from music_rllib.store.serialization import read_state, write_state
 
 SIZES = Sizes(6, 3, 2, (0, 1, 2), (3, 4, 5))
@@ -224,14 +226,59 @@ def test_what_does_not_fit_is_named(name: str, settings: Any, message: str) -> N
         made(name, **settings)
 
 
-def test_a_bonus_of_another_shape_is_refused_instead_of_broadcast() -> None:
-    class Column(Speed):
-        def bonus(self, batch: Batch) -> Tensor:
-            return super().bonus(batch).unsqueeze(1)
+@pytest.mark.parametrize(
+    ("method", "result", "message"),
+    [
+        ("bonus", torch.ones(64, 1), r"of shape \(64,\), got one of torch\.float32 and \(64, 1\)"),
+        ("bonus", torch.ones(64).bool(), r"tensor of floats .* got one of torch\.bool"),
+        ("bonus", np.ones(64), r"^Wrong\.bonus must return a tensor .*, got ndarray"),
+        ("loss", 0.5, r"^Wrong\.loss must return a tensor of floats and of shape \(\), got float"),
+        ("loss", torch.ones(64), r"got one of torch\.float32 and \(64,\)"),
+        ("loss", torch.tensor(1.0), r"^Wrong\.loss must depend on the reward's parameters"),
+        ("of_episode", torch.ones(9), r"of shape \(8,\), got one of torch\.float32 and \(9,\)"),
+    ],
+    ids=str,
+)
+def test_a_result_that_does_not_fit_is_refused_instead_of_broadcast(
+    method: str, result: Any, message: str
+) -> None:
+    class Wrong(Unusual):
+        trajectories = 0
 
-    with pytest.raises(ValueError, match=r"of shape \(64,\), got shape \(64, 1\)"):
-        RewardLearner(Column(SIZES), 1e-3, frozen=False).learn(batch(), 1)
-    assert reward_class(OWN).__name__ == "Speed"
+        def loss(self, batch: Batch) -> Tensor:
+            return (batch.states - self.center).square().mean()
+
+    setattr(Wrong, method, lambda *_: result)
+    learner = RewardLearner(Wrong(SIZES), 1e-3, frozen=False)
+    frames = np.zeros((9, 12), np.float32)
+    played = Trajectory(frames, frames[:8, :2], frames[:8, 0], terminated=False)
+
+    def use() -> None:
+        learner.learn(batch(), 1)
+        learner.values_of([played])
+
+    with pytest.raises(ValueError, match=message):
+        use()
+
+
+@pytest.mark.parametrize("name", ["alpha", "intrinsic/reward"])
+def test_a_metric_must_not_replace_another(name: str) -> None:
+    class Wrong(Speed):
+        def metrics(self) -> dict[str, float]:
+            return {name: 1.0}
+
+    with pytest.raises(ValueError, match=f"must begin with intrinsic/ .*, got '{name}'"):
+        RewardLearner(Wrong(SIZES), 1e-3, frozen=False).metrics()
+
+
+def test_a_class_whose_constructor_does_not_call_its_parents_is_named() -> None:
+    class Forgetful(Speed):
+        def __init__(self, sizes: Sizes) -> None:
+            self.factor = 1.0
+
+    globals()["Forgetful"] = Forgetful
+    with pytest.raises(ValueError, match=r"Forgetful must call super\(\).__init__\(sizes\)"):
+        made(f"{__name__}:Forgetful")
 
 
 @pytest.mark.parametrize("number", [-0.5, torch.nan, torch.inf])
