@@ -21,7 +21,8 @@ JOINT = "joint entropy, HER alone"
 MUSIC = "per-dimension entropy, MUSIC-r"
 STUDIES = {
     "joint-music": "joint entropy, MUSIC-r",
-    "equal-entropy": "joint entropy at 1.5 nats, MUSIC-r",
+    "equal-entropy-fixed": "joint entropy, 1.5 nats by a fixed α, MUSIC-r",
+    "equal-entropy": "joint entropy, 1.5 nats by a learned α, MUSIC-r",
     "joint-her": JOINT,
     "claims-push": MUSIC,
     "joint-pick": "joint entropy, MUSIC-r",

@@ -24,9 +24,11 @@ MARGIN = 0.05
 MEAN, SAMPLED = "evaluation/success_rate", "training/success_rate"
 ENTROPIES = ("entropy/shannon", "entropy/tsallis")
 JOINT, MUSIC = "joint entropy, HER alone", "per-dimension entropy, MUSIC-r"
+AT = "joint entropy, 1.5 nats by"
 STUDIES = {  # export and compared stage
     ("FetchPush", "joint entropy, MUSIC-r"): ("joint-music", "music-r"),
-    ("FetchPush", "joint entropy at 1.5 nats, MUSIC-r"): ("equal-entropy", "music-r"),
+    ("FetchPush", f"{AT} a fixed α, MUSIC-r"): ("equal-entropy-fixed", "music-r"),
+    ("FetchPush", f"{AT} a learned α, MUSIC-r"): ("equal-entropy", "music-r"),
     ("FetchPush", JOINT): ("joint-her", "her"),
     ("FetchPush", MUSIC): ("claims-push", "music-r"),
     ("FetchPickAndPlace", "joint entropy, MUSIC-r"): ("joint-pick", "music-r"),
@@ -36,18 +38,17 @@ STUDIES = {  # export and compared stage
 TOTALS = {"claims-pick-and-place": 200_000, "joint-music": 30_000}
 """Steps with pretraining at which MUSIC-r is compared with HER alone."""
 COUNTED = {
-    "joint-music": 30_000,
-    "equal-entropy": 30_000,
-    "joint-pick": 80_000,
-    "pick-and-place-in-80000-steps": 80_000,
+    **dict.fromkeys(("joint-music", "equal-entropy-fixed", "equal-entropy"), 30_000),
+    **dict.fromkeys(("joint-pick", "pick-and-place-in-80000-steps"), 80_000),
 }
 """Steps of the studies whose metric counts the pretraining."""
 IN_DETAIL = {
+    "equal-entropy": "**With a learned α**",
     "joint-her": "## FetchPush in the joint form, HER alone\n",
     "claims-push": "## FetchPush\n",
     "claims-pick-and-place": "## FetchPickAndPlace\n",
 }
-"""Studies whose tables are on the page of details: the headings before them."""
+"""Studies whose tables are on the page of details: the text before them."""
 BETWEEN_Q = (("1.5", "1"), ("2", "1.5"), ("2", "1"))
 KINDS = ("p", "tost")
 Claim = dict[str, Any]
