@@ -193,14 +193,18 @@ def _control(sweep: Sweep, study: Study, stage: StageRuns) -> str:
     version = study.plan or study.latest
     if version is not None:
         return version.plan.control
-    alphas = {sweep.runs[one.runs[0]].tags.get(names.TAG_ALPHA, "") for one in stage.compared}
-    words = sorted(alphas)
+    alphas = {
+        (one.entropic_index, sweep.runs[one.runs[0]].tags.get(names.TAG_ALPHA, ""))
+        for one in stage.compared
+    }
+    words = sorted({alpha for _, alpha in alphas})
     if stage.is_search:
         return f"settings were searched on other seeds; α is {', '.join(words)}"
+    indices = len({q for q, _ in alphas})
     if len(words) > 1:
-        return f"α varies with q ({', '.join(words)})"
-    same_q = len({condition.entropic_index for condition in stage.compared}) == 1
-    if same_q or is_controlled(words[0]):
+        with_q = " with q" if len(alphas) == indices else ""
+        return f"α varies{with_q} ({', '.join(words)})"
+    if indices == 1 or is_controlled(words[0]):
         return f"α {words[0]}"
     return f"none, one α ({words[0]}) for all: policies of different q differ in entropy"
 

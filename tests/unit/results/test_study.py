@@ -163,6 +163,28 @@ def test_without_planned_results_there_is_no_answer(
     assert "Not tested: q = 1.5 against q = 1: no run of q = 1.5 that may be compared" in said
 
 
+@pytest.mark.parametrize(
+    ("alphas", "expected"),
+    [
+        ({"1": ["0.05"], "2": ["0.1"]}, "α varies with q (0.05, 0.1)"),
+        ({"1": ["0.05", "0.1"]}, "α varies (0.05, 0.1)"),
+        ({"1": ["0.05", "0.1"], "2": ["0.05", "0.1"]}, "α varies (0.05, 0.1)"),
+        ({"1": ["0.05"], "2": ["0.05"]}, "none, one α (0.05) for all: policies of different q"),
+    ],
+)
+def test_without_a_plan_the_control_is_read_from_the_runs(
+    alphas: Mapping[str, Sequence[str]], expected: str, rng: np.random.Generator
+) -> None:
+    runs = [
+        run({"tac.entropic_index": q, "tac.alpha": alpha}, seed, 0.3, rng)
+        for q, values in alphas.items()
+        for alpha in values
+        for seed in range(5)
+    ]
+    sweep = sweep_of(runs)
+    assert f"Control: {expected}" in " ".join(answer(sweep, study_of(sweep)))
+
+
 def test_a_plan_recorded_after_a_result_does_not_count(rng: np.random.Generator) -> None:
     runs = study({"1": 0.2, "1.5": 0.4}, 8, rng)
     late = with_plan((), plan("q = 1.5 better than q = 1"), DONE)
