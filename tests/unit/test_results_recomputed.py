@@ -348,7 +348,10 @@ def test_every_row_of_a_table_of_stages(study: str, total: int, page: str) -> No
 def test_every_figure_of_the_readme_is_on_the_page() -> None:
     readme = (DOCS.parent / "README.md").read_text("utf-8").replace("−", "-")
     section = readme[readme.index("## Results") : readme.index("## In your own")]
-    found = re.findall(r"([+-]\d\.\d\d), (?:95% CI )?(-?\d\.\d\d) to (-?\d\.\d\d)", section)
-    assert len(found) >= 3
-    for value, low, high in found:
-        assert re.search(rf"{re.escape(value)} \(95% CI {low} to {high};", PAGE)
+    verdicts = "worse|undecided|superior|equivalent within 0.05"
+    found = re.findall(rf"({verdicts}), ([+-]\d\.\d\d \(9[05]% CI [\d.-]+ to [\d.-]+)\)", section)
+    assert 3 <= len(found) == section.count("% CI")
+    for verdict, numbers in found:
+        assert f"**{verdict}**, {numbers};" in PAGE
+    for percent in re.findall(r"\d+%(?! CI)", section):
+        assert f"| {percent} [" in PAGE
