@@ -114,7 +114,7 @@ class IntrinsicReward(nn.Module, ABC):
             ValueError: `bonus` returned something else, or numbers that are negative or not finite.
         """
         bonus = self.bonus(batch)
-        self.check_result("bonus", bonus, (len(batch.states),))
+        check_result(self, "bonus", bonus, (len(batch.states),))
         wrong = bonus[~((bonus >= 0.0) & (bonus < torch.inf))]
         if len(wrong):
             rule = f"{type(self).__name__}.bonus must return finite numbers >= 0"
@@ -128,16 +128,19 @@ class IntrinsicReward(nn.Module, ABC):
         scale = scale.clamp(min=max(self.smallest_scale, 1e-12)).to(bonus)
         return (bonus / scale).clamp(0.0, 1.0) - 1.0, bonus
 
-    def check_result(self, method: str, found: object, shape: tuple[int, ...]) -> None:
-        """Raise ValueError if a method's result is no tensor of floats of this shape."""
-        if isinstance(found, Tensor):
-            if found.is_floating_point() and found.shape == shape:
-                return
-            kind = f"one of {found.dtype} and {tuple(found.shape)}"
-        else:
-            kind = type(found).__name__
-        rule = f"{type(self).__name__}.{method} must return a tensor of floats and of shape {shape}"
-        raise ValueError(f"{rule}, got {kind}")
+
+def check_result(
+    reward: IntrinsicReward, method: str, found: object, shape: tuple[int, ...]
+) -> None:
+    """Raise ValueError if the result of a reward's method is no tensor of floats of this shape."""
+    if isinstance(found, Tensor):
+        if found.is_floating_point() and found.shape == shape:
+            return
+        kind = f"one of {found.dtype} and {tuple(found.shape)}"
+    else:
+        kind = type(found).__name__
+    rule = f"{type(reward).__name__}.{method} must return a tensor of floats and of shape {shape}"
+    raise ValueError(f"{rule}, got {kind}")
 
 
 # -- parts of networks ---------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from music_rllib import names
 from music_rllib.envs.tasks import make_importable
-from music_rllib.intrinsic.interface import Batch, IntrinsicReward, Sizes
+from music_rllib.intrinsic.interface import Batch, IntrinsicReward, Sizes, check_result
 from music_rllib.intrinsic.settings import BUILT_IN, IntrinsicSettings
 from music_rllib.kernels.adam import FusedAdam
 from music_rllib.replay.trajectories import Floats, Trajectory
@@ -117,7 +117,7 @@ class RewardLearner:
             arrays = (episode.frames[:, :width], episode.actions)
             with torch.no_grad():
                 values = self.reward.of_episode(*(torch.tensor(a, device=device) for a in arrays))
-            self.reward.check_result("of_episode", values, (len(episode),))
+            check_result(self.reward, "of_episode", values, (len(episode),))
             found.append(cast("Tensor", values).cpu().numpy())
         return found
 
@@ -172,7 +172,7 @@ class RewardLearner:
             loss = self.reward.loss(batch)
         if loss is None:
             return
-        self.reward.check_result("loss", loss, ())
+        check_result(self.reward, "loss", loss, ())
         if not loss.requires_grad:
             name = type(self.reward).__name__
             raise ValueError(f"{name}.loss must depend on the reward's parameters without detach()")
