@@ -8,11 +8,10 @@ generator replaces `{{ KIND NAME }}` by a table of the sweep NAME. If tune_confi
 this name, the table has all its runs that any export in docs/results/data has, whichever sweep
 trained them; otherwise it has the runs of the export docs/results/data/NAME. KIND is
 
-- without NAME, over the studies of `summary.STUDIES`: `headline`, `summary`, `sampled` or
-  `robustness`;
-- for a planned study: `verdict` (with the hypothesis), `answer`, `outcomes` (with stages),
-  `seeds`, `cells`, `figure` (with its name), `learning`, `arms`, `peers`, `equal-total`, `hours` or
-  `progress`;
+- without NAME, over the studies of `summary.STUDIES`: `headline`, `summary`, `sampled`,
+  `exploration` or `robustness`;
+- for a planned study: `answer`, `outcomes` (with stages), `seeds`, `cells`, `figure` (with its
+  name), `learning`, `arms`, `peers`, `equal-total`, `hours` or `progress`;
 - for any sweep: `totals` (with a pretrained stage and one from scratch), `runs`, `provenance`,
   `success`, `stages` or `curves` (with stages, if not all), `metric` (with metrics), or `search`.
 
@@ -26,6 +25,7 @@ import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+from docs.result_pages.exploration import exploration_table
 from docs.result_pages.exports import hours_text, progress_text, sweep_called
 from docs.result_pages.learning import learning_figure, overview, peers_figure
 from docs.result_pages.robustness import robustness_list
@@ -37,7 +37,6 @@ from docs.result_pages.studies import (
     named_figure,
     outcomes_table,
     seeds_table,
-    verdict_text,
 )
 from docs.result_pages.success import stage_curves, stages_table, success
 from docs.result_pages.summary import (
@@ -90,9 +89,9 @@ def page(name: str, figures: dict[str, Drawing]) -> str:
         "headline": headline,
         "summary": lambda: "\n".join(summary_table()),
         "sampled": sampled_sentence,
+        "exploration": lambda: "\n".join(exploration_table()),
         "robustness": lambda: "\n".join(robustness_list()),
         "equal-total": equal_total_text,
-        "verdict": verdict_text,
         "progress": progress_text,
         "hours": hours_text,
     }

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from docs.result_pages.exports import config_of, is_complete, progress_text, sweep_called
+from docs.result_pages.exports import is_complete, progress_text
 from docs.result_pages.figures import figure
 from docs.result_pages.runs import last_value
 from docs.result_pages.words import percent, rate_cells, row, rule, spread, wait_text
@@ -15,31 +15,10 @@ from music_rllib import names
 from music_rllib.report.figures.choice import Drawing, slug, stage_drawings, study_drawings
 from music_rllib.results import statistics as st
 from music_rllib.results.analysis import THRESHOLDS, StageAnalysis, analyse
-from music_rllib.results.analysis_plan import analysis_plan
-from music_rllib.results.answer import answer, not_excluded, numbers_in_words, verdict_in_words
+from music_rllib.results.answer import answer
 from music_rllib.results.data import Sweep
 from music_rllib.results.scores import counted, scores_of
 from music_rllib.results.study import Mean, study_of
-
-
-def verdict_text(name: str, *words: str) -> str:
-    """The verdict on a hypothesis of a study's plan; before all runs have finished, its progress.
-
-    Raises:
-        ValueError: The plan has no such hypothesis.
-    """
-    config, hypothesis = config_of(name), " ".join(words)
-    plan = analysis_plan(config) if config else None
-    if plan is None or hypothesis not in plan.hypotheses:
-        raise ValueError(f"{name} has no hypothesis {hypothesis!r}")
-    sweep = sweep_called(name)
-    if sweep is None or not is_complete(sweep):
-        return progress_text(name)
-    claims = {claim.hypothesis.text: claim for claim in study_of(sweep).planned if claim.hypothesis}
-    claim = claims[hypothesis]
-    seeds = claim.contrast.seeds[0]
-    numbers = numbers_in_words(claim)
-    return f"**{verdict_in_words(claim)}**, {numbers}; {seeds} seeds{not_excluded(claim)}"
 
 
 def answer_text(sweep: Sweep) -> Iterator[str]:

@@ -227,6 +227,15 @@ class Sweep:
         values = self.column(run, metric).value
         return float(values[-1]) if len(values) and np.isfinite(values[-1]) else None
 
+    def early(self, run: int, metric: str) -> float | None:
+        """Mean of a metric of `runs[run]` over the first quarter of its steps; None without one.
+
+        There, training episodes show exploration rather than what was learned.
+        """
+        steps, values = self.finite(run, metric)
+        is_early = (steps > 0) & (steps <= 0.25 * (self.runs[run].budget or self.last_step(run)))
+        return float(values[is_early].mean()) if is_early.any() else None
+
     def having(self, wanted: Callable[[RunRecord], bool]) -> Sweep:
         """The sweep with the runs for which `wanted` is true."""
         kept = [position for position, run in enumerate(self.runs) if wanted(run)]

@@ -23,6 +23,7 @@ DETAILS = (DOCS / "lab" / "claims.md").read_text("utf-8")
 MARGIN = 0.05
 MEAN, SAMPLED = "evaluation/success_rate", "training/success_rate"
 ENTROPIES = ("entropy/shannon", "entropy/tsallis")
+MOVED = "training/object_displacement"
 JOINT, MUSIC = "joint entropy, HER alone", "per-dimension entropy, MUSIC-r"
 AT = "joint entropy, 1.5 nats by"
 STUDIES = {  # export and compared stage
@@ -70,7 +71,7 @@ def runs(study: str, stage: str) -> pd.DataFrame:
 @cache
 def metrics(study: str) -> pd.DataFrame:
     path = DOCS / "results/data" / study / "metrics.parquet"
-    table = pd.read_parquet(path, filters=[("metric", "in", [MEAN, SAMPLED, *ENTROPIES])])
+    table = pd.read_parquet(path, filters=[("metric", "in", [MEAN, SAMPLED, MOVED, *ENTROPIES])])
     return table.dropna().set_index(["run", "metric"]).sort_index()
 
 
@@ -222,12 +223,39 @@ def test_every_row_of_the_summary() -> None:
 
 
 def test_the_verdicts_at_several_alphas() -> None:
-    """Numbers of the section on q and entropy, in the order of its list."""
+    """Planned comparisons of the factorial, in the order of its plan."""
     pairs = (("1.5", "1"), ("2", "1"), ("2", "1.5"))
     sides = {q: areas("q-entropy-factorial", "her", q, MEAN) for q in ("1", "1.5", "2")}
     claims = decided([compared(sides[a], sides[b]) for a, b in pairs])
-    found = re.findall(r"^- q = .* against q = .*: (\*\*.*); 5 seeds(.*)\.$", PAGE, re.MULTILINE)
-    assert ["".join(words) for words in found] == [in_words(one, planned=True) for one in claims]
+    found = re.findall(r"^- q = .*, averaged over 5 settings: (.*)\.$", DETAILS, re.MULTILINE)
+    assert found == [in_words(one, planned=True).replace("**", "") for one in claims]
+
+
+def early(study: str, stage: str, q: str, metric: str) -> pd.Series:
+    """Mean of each seed over the first quarter of the steps."""
+    own = runs(study, stage).query("q == @q")
+    values = []
+    for run, budget in zip(own.run, own.budget, strict=True):
+        steps, found = curve(study, run, metric)
+        values.append(found[(steps > 0) & (steps <= budget / 4)].mean())
+    return pd.Series(values, own.seed)
+
+
+def test_every_row_of_the_table_of_exploration() -> None:
+    _, _, *rows = table("## What q does to exploration")
+    expected = []
+    for (task, setting), (study, stage) in STUDIES.items():
+        by_q = ("1", "1.5", "2")
+        entropies = [early(study, stage, q, ENTROPIES[0]).mean() for q in by_q]
+        moved = [100 * early(study, stage, q, MOVED) for q in by_q]
+        cells = [", ".join(f"{entropy:.2f}" for entropy in entropies)]
+        cells.append(", ".join(f"{one.mean():.1f}" for one in moved))
+        for one in moved[1:]:
+            gap = one - moved[0]
+            low, high = stats.t.interval(0.95, len(gap) - 1, gap.mean(), stats.sem(gap))
+            cells.append(f"{gap.mean():+.1f} (95% CI {low:.1f} to {high:.1f})")
+        expected.append([task, setting, *cells])
+    assert rows == expected
 
 
 def rate_interval(values: Array, episodes: float) -> tuple[float, float, float]:

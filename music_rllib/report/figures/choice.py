@@ -19,6 +19,7 @@ from music_rllib.report.figures.plots import (
     alpha_subplot,
     curve_subplot,
     entropy_subplot,
+    exploration_subplot,
     finals_subplot,
     profile_subplot,
     styles_of,
@@ -31,6 +32,7 @@ from music_rllib.results.study import MOST_CONDITIONS, Study, alpha_lines
 
 FINALS = {names.EVAL_SUCCESS: "Final success rate", names.EVAL_RETURN: "Final return"}
 AGAINST_ENTROPY = "Performance against entropy"
+EXPLORATION_AGAINST_ENTROPY = "Exploration against entropy"
 PERFORMANCE, EXPLORATION, INFORMATION = "Performance", "Exploration", "Information"
 SETTINGS, COST = "Settings", "Cost"
 GROUPS = (PERFORMANCE, EXPLORATION, INFORMATION, SETTINGS, COST)
@@ -231,19 +233,36 @@ def _finals(stage: StageRuns, title: str, scopes: Sequence[Scope]) -> Drawing:
 
 
 def _against_entropy(sweep: Sweep, stage: StageRuns) -> Iterator[Drawing]:
+    """Performance and exploration, which entropy alone may explain."""
     # Other settings move the points, so that color and marker stand for q alone.
     by_q = _styles_by_q(stage.conditions)
     styles = {condition: by_q[condition.entropic_index] for condition in stage.conditions}
-    subplots = [entropy_subplot(sweep, task, styles) for task in stage.tasks]
-    if any(subplots) and len(stage.conditions) > 1:
-        yield Drawing(
-            stage=stage.name,
-            title=AGAINST_ENTROPY,
-            caption="One point for each finished run. If all q fall on one curve, entropy explains "
+    for title, group, subplot_of, caption in (
+        (
+            AGAINST_ENTROPY,
+            PERFORMANCE,
+            entropy_subplot,
+            "One point for each finished run. If all q fall on one curve, entropy explains "
             "performance; if they differ at equal entropy, q itself matters.",
-            subplots=tuple(filter(None, subplots)),
-            legend=[(f"q = {q}", style) for q, style in by_q.items()],
-        )
+        ),
+        (
+            EXPLORATION_AGAINST_ENTROPY,
+            EXPLORATION,
+            exploration_subplot,
+            "Training episodes in the first quarter of the steps, with the entropy of the policy "
+            "in the same steps. Small points: finished runs. Large points: means over the seeds.",
+        ),
+    ):
+        subplots = tuple(filter(None, (subplot_of(sweep, task, styles) for task in stage.tasks)))
+        if subplots and len(stage.conditions) > 1:
+            yield Drawing(
+                stage=stage.name,
+                title=title,
+                caption=caption,
+                subplots=subplots,
+                legend=[(f"q = {q}", style) for q, style in by_q.items()],
+                group=group,
+            )
 
 
 def _styles_by_q(conditions: Sequence[Condition]) -> dict[str, Style]:

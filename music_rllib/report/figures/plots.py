@@ -26,7 +26,7 @@ from music_rllib.results import statistics as st
 from music_rllib.results.analysis import Curve, FinalScores, Scope
 from music_rllib.results.conditions import Condition
 from music_rllib.results.data import Sweep
-from music_rllib.results.scores import Measure, measure_on, scores_of
+from music_rllib.results.scores import measure_on, scores_of
 from music_rllib.results.statistics import SHOW_SEEDS_BELOW, Array, Estimate
 from music_rllib.results.study import AlphaLine, Mean
 
@@ -318,30 +318,71 @@ def entropy_subplot(sweep: Sweep, task: str, styles: Styles) -> Subplot | None:
     """
     runs = [run for condition in styles for run in condition.runs]
     measure = measure_on(sweep, task, runs, "auc")
-    points = {condition: list(_points(sweep, condition, task, measure)) for condition in styles}
-    if sum(map(len, points.values())) < 2:
+    scores = {one: scores_of(sweep, one, task, measure).by_seed for one in styles}
+    points = {
+        condition: [
+            (sweep.final(run, names.SHANNON_ENTROPY), scores[condition].get(sweep.runs[run].seed))
+            for run in _finished(sweep, condition, task)
+        ]
+        for condition in styles
+    }
+    return _over_entropy(task, points, styles, ("final Shannon entropy (nats)", measure.words))
+
+
+def exploration_subplot(sweep: Sweep, task: str, styles: Styles) -> Subplot | None:
+    """The displacement of the object in early training episodes over the entropy in these steps.
+
+    A point for each finished run, and a larger one for the mean of each condition.
+
+    Returns:
+        None if fewer than two runs have both.
+    """
+    points = {
+        condition: [
+            (
+                sweep.early(run, names.SHANNON_ENTROPY),
+                sweep.early(run, names.TRAIN_DISPLACEMENT),
+            )
+            for run in _finished(sweep, condition, task)
+        ]
+        for condition in styles
+    }
+    axes = ("Shannon entropy (nats)", "object displacement (m)")
+    return _over_entropy(task, points, styles, axes, with_means=True)
+
+
+def _finished(sweep: Sweep, condition: Condition, task: str) -> Iterator[int]:
+    of_task = (run for run in condition.runs if sweep.runs[run].task == task)
+    return (run for run in of_task if sweep.runs[run].is_finished)
+
+
+def _over_entropy(
+    task: str,
+    points: Mapping[Condition, Sequence[tuple[float | None, float | None]]],
+    styles: Styles,
+    labels: tuple[str, str],
+    *,
+    with_means: bool = False,
+) -> Subplot | None:
+    """A point for each pair without None; no subplot for fewer than two points."""
+    known = {
+        condition: np.array([pair for pair in pairs if None not in pair], float).reshape(-1, 2)
+        for condition, pairs in points.items()
+    }
+    if sum(map(len, known.values())) < 2:
         return None
 
     def draw(axes: Axes) -> None:
-        for condition, pairs in points.items():
+        for condition, pairs in known.items():
             color, marker, _ = styles[condition]
-            if pairs:
-                axes.plot(*zip(*pairs, strict=True), marker, color=color, ms=6, alpha=0.75, mew=0)
-        axes.set_xlabel("final Shannon entropy (nats)")
-        axes.set_ylabel(measure.words)
+            if with_means and len(pairs):
+                axes.plot(*pairs.T, marker, color=color, ms=3, alpha=0.35, mew=0)
+                pairs = pairs.mean(axis=0, keepdims=True)
+            axes.plot(*pairs.T, marker, color=color, ms=6, alpha=0.75, mew=0)
+        axes.set_xlabel(labels[0])
+        axes.set_ylabel(labels[1])
 
     return Subplot(title=task, draw=draw)
-
-
-def _points(
-    sweep: Sweep, condition: Condition, task: str, measure: Measure
-) -> Iterator[tuple[float, float]]:
-    scores = scores_of(sweep, condition, task, measure).by_seed
-    for run in condition.runs:
-        record = sweep.runs[run]
-        entropy = sweep.final(run, names.SHANNON_ENTROPY)
-        if record.task == task and record.seed in scores and entropy is not None:
-            yield entropy, scores[record.seed]
 
 
 def alpha_subplot(task: str, lines: Sequence[tuple[AlphaLine, Style]]) -> Subplot:

@@ -23,7 +23,11 @@ import music_rllib
 from music_rllib import names
 from music_rllib.report.build import build_report, made_files, write_report
 from music_rllib.report.charts import _mean_at, curves_csv
-from music_rllib.report.figures.choice import AGAINST_ENTROPY, SETTINGS
+from music_rllib.report.figures.choice import (
+    AGAINST_ENTROPY,
+    EXPLORATION_AGAINST_ENTROPY,
+    SETTINGS,
+)
 from music_rllib.report.figures.draw import TEXT_WIDTH, drawn_figure, files
 from music_rllib.report.page import SweepReport, render
 from music_rllib.results.analysis import THRESHOLDS, analyse
@@ -240,6 +244,30 @@ def test_final_entropies_are_in_a_table_and_a_figure() -> None:
     areas = [0.505 * final for final in (0.5, 0.6, 0.7, 0.4, 0.5, 0.6)]
     expected = sorted(zip(values, areas, strict=True))
     np.testing.assert_allclose(points, expected, rtol=1e-6)
+
+
+def test_exploration_is_that_of_training_episodes_in_the_first_quarter() -> None:
+    runs = [(one_run(q, seed), climbing(0.9)) for q in ("1", "2") for seed in (0, 1)]
+    sweep = sweep_of(runs)
+    quarter = STEPS[-1] // 4
+    steps = [0, quarter // 2, quarter, quarter + 1, STEPS[-1]]
+
+    def values(first: float) -> Points:
+        early = [9.0, first, first + 0.2, 9.0, 9.0]
+        names_ = [names.SHANNON_ENTROPY] * 5 + [names.TRAIN_DISPLACEMENT] * 5
+        return Points(names_, steps * 2, [0] * 10, early + [value / 10 for value in early])
+
+    early = columns([values(first) for first in (1.0, 1.2, 2.0, 2.4)])
+    sweep = replace(sweep, history={**sweep.history, **early})
+    (drawing,) = [
+        one for one in build_report(sweep).drawings if one.title == EXPLORATION_AGAINST_ENTROPY
+    ]
+    axes = drawn_figure(drawing.subplots, drawing.legend, TEXT_WIDTH).axes[0]
+    drawn = [np.asarray(line.get_xydata()) for line in axes.lines]
+    # For each q its two runs, then their mean.
+    expected = [[[1.1], [1.3]], [[1.2]], [[2.1], [2.5]], [[2.3]]]
+    for points, entropies in zip(drawn, expected, strict=True):
+        np.testing.assert_allclose(points, np.array(entropies) * [1.0, 0.1])
 
 
 def test_a_failed_run_has_no_final_value_and_is_censored_in_times_to_a_threshold() -> None:
