@@ -29,6 +29,8 @@ _PAGE_FONT, _PAPER_FONT = 10.0, 8.0
 _DPI = 150
 _LETTER = 0.07
 """Width in inches of a letter in a legend."""
+_LETTERS_OF_AN_AXIS = 12
+"""Letters per inch of a subplot in a line of the labels of its axes."""
 
 # Matplotlib draws with the first colors, and the page's own colors then replace them in the SVG.
 _STAND_INS = ("#010203", "#040506", "#070809")
@@ -122,8 +124,14 @@ def drawn_figure(subplots: Sequence[Subplot], legend: Legend, width: float) -> F
         axes.set_title(subplot.title)
         axes.patch.set_alpha(0.0)
         subplot.draw(axes)
+        axes.set_xlabel(_wrapped(axes.get_xlabel(), width / columns))
+        axes.set_ylabel(_wrapped(axes.get_ylabel(), scale * subplot.height))
     if legend:
         handles = legend_handles(legend)
         figure.legend(handles=handles, loc="outside lower center", ncols=entries, frameon=False)
     ConstrainedLayoutEngine().execute(figure)  # an engine of the figure would draw it once more
     return figure
+
+
+def _wrapped(label: str, inches: float) -> str:
+    return textwrap.fill(label, int(_LETTERS_OF_AN_AXIS * inches))

@@ -15,8 +15,10 @@ from itertools import product
 from pathlib import Path
 from xml.etree import ElementTree
 
+import matplotlib as mpl
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 
 import music_rllib
@@ -29,6 +31,7 @@ from music_rllib.report.figures.choice import (
     SETTINGS,
 )
 from music_rllib.report.figures.draw import TEXT_WIDTH, drawn_figure, files
+from music_rllib.report.figures.plots import Subplot
 from music_rllib.report.page import SweepReport, render
 from music_rllib.results.analysis import THRESHOLDS, analyse
 from music_rllib.results.answer import answer
@@ -624,6 +627,24 @@ def test_a_legend_stays_inside_its_figure() -> None:
         box, whole = figure.legends[0].get_window_extent(), figure.bbox
         assert 0 <= box.x0 < box.x1 <= whole.x1
         assert 0 <= box.y0 < box.y1 < figure.axes[0].get_window_extent().y0
+
+
+@pytest.mark.parametrize(
+    ("width", "font", "count"), [(4.3, 10, 1), *((7.16, 8, n) for n in (1, 3))]
+)
+def test_long_labels_of_axes_stay_inside_their_figure(width: float, font: int, count: int) -> None:
+    def draw(axes: Axes) -> None:
+        label = "mean success over 1,000,000 steps, pretraining included"
+        axes.set(xlabel=f"{label} τ", ylabel=label)
+
+    with mpl.rc_context({"font.size": font}):
+        figure = drawn_figure([Subplot(title="FetchPush", draw=draw)] * count, [], width)
+        figure.draw_without_rendering()
+    for axes in figure.axes:
+        for label in (axes.xaxis.label, axes.yaxis.label):
+            box, whole = label.get_window_extent(), figure.bbox
+            assert whole.x0 <= box.x0 < box.x1 <= whole.x1
+            assert whole.y0 <= box.y0 < box.y1 <= whole.y1
 
 
 def test_a_new_report_removes_old_figures_and_equal_sweeps_have_equal_files(
