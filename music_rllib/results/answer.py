@@ -39,6 +39,9 @@ def answer(sweep: Sweep, study: Study) -> list[str]:
     if study.stage is None and any(run.status != "SCHEDULED" for run in sweep.runs):
         return [*sentences, "No stage trains for the task: no comparison."]
     if study.stage is None or not study.means:
+        if study.stage is not None and study.stage.is_search:
+            why = "trials are not compared on the seeds that select them"
+            return [*sentences, f"No run on fresh seeds has finished: {why}."]
         return [*sentences, "No run that may be compared has finished yet."]
     shown = [claim for claim in study.claims if claim.task == ALL_TASKS] or list(study.claims)
     sentences += [f"{claim_in_words(claim)}." for claim in shown[:MOST_CLAIMS]]

@@ -206,7 +206,8 @@ def test_trials_of_a_search_are_not_compared_on_its_seeds() -> None:
     (analysis,) = analyse(sweep)
     assert len(analysis.scopes[0].compared) < 2
     assert len(analysis.scopes[0].finals) == 3, "the table has them"
-    assert "No run that may be compared has finished yet." in answer_to(sweep)
+    said = "No run on fresh seeds has finished: trials are not compared on the seeds that"
+    assert said in answer_to(sweep)
 
 
 def test_the_answer_of_a_search_is_about_fresh_seeds() -> None:
