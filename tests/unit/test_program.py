@@ -220,7 +220,9 @@ def test_the_schema_accepts_shipped_sweeps_and_rejects_unknown_names(
     assert all("description" in field for field in described.values())
 
 
-@pytest.mark.parametrize("program", ["music_rllib plan", "music_rllib.sweep"])
+@pytest.mark.parametrize(
+    "program", ["music_rllib plan", "music_rllib.sweep", "music_rllib.sweep --name other"]
+)
 def test_it_runs_as_a_module_from_any_folder(program: str, tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-m", *program.split(), "tac.alpha=-1"],
