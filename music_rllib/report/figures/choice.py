@@ -14,6 +14,7 @@ from music_rllib.report.figures.plots import (
     MOST_BANDS,
     Legend,
     Metric,
+    Style,
     Subplot,
     alpha_subplot,
     curve_subplot,
@@ -21,8 +22,8 @@ from music_rllib.report.figures.plots import (
     exploration_subplot,
     finals_subplot,
     profile_subplot,
+    styles_of,
 )
-from music_rllib.report.figures.styles import Style, styles_of
 from music_rllib.results.analysis import Curve, FinalScores, Scope, StageAnalysis, curve
 from music_rllib.results.conditions import ALPHA, Condition, StageRuns, stages_together
 from music_rllib.results.data import Sweep

@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from music_rllib.report.figures.styles import DARK, LIGHT, color_of, marker_of, styles_of
+from music_rllib.report.figures.plots import DARK, LIGHT, color_of, marker_of, styles_of
 from music_rllib.results.conditions import Condition
 
 COMPARED = ("0.5", "1", "1.5", "2", "3")

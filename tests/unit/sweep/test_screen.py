@@ -17,7 +17,7 @@ from music_rllib.config.schema import SweepConfig
 from music_rllib.config.tac_settings import LearnedAlpha, setting_text
 from music_rllib.experiment.plan import Plan, make_plan
 from music_rllib.experiment.scheduler import Failure, Scheduler
-from music_rllib.report.figures.styles import color_of
+from music_rllib.report.figures.plots import color_of
 from music_rllib.schedules import Linear, Piecewise
 from music_rllib.store.history import Report, RunResult
 from music_rllib.store.storage import resolve_storage, sweep_folder
