@@ -14,15 +14,15 @@ coverage of the intervals here; docs/reports.md lists it.
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 from numpy.typing import ArrayLike, NDArray
 
 # Bit for bit the values of scipy.stats (bdtr to 1e-15), whose import takes 0.5 s and 50 MB.
-from scipy.special import bdtr, betaincinv, ndtri, stdtrit
+from scipy.special import bdtr, betaincinv, nctdtr, ndtri, stdtrit
 
 Array = NDArray[np.float64]
 
@@ -255,21 +255,25 @@ def seeds_needed(
         Numbers to detect a difference of `size`, and to show equivalence within it if there is no
         difference; None if `MAX_SEEDS` are not enough.
     """
-    seeds = np.arange(2.0, MAX_SEEDS + 1)  # one seed never decides
-    freedom = (1 if paired else 2) * (seeds - 1)
 
-    def below(end: Array) -> Array:
-        """Cumulative noncentral t; scipy's NaN far from the center means 0."""
-        below = scipy.stats.nct.cdf(end, freedom, size / spread * np.sqrt(seeds))
-        return np.asarray(np.nan_to_num(below, nan=0.0))
+    def tails(seeds: int, tail: float) -> Array:
+        """Probabilities of t below its quantiles `tail` and `1 - tail` if there is a difference."""
+        freedom = (1 if paired else 2) * (seeds - 1)
+        end = stdtrit(freedom, 1 - tail)
+        below = nctdtr(freedom, size / spread * math.sqrt(seeds), [-end, end])
+        return np.asarray(np.nan_to_num(below, nan=0.0))  # scipy's NaN far from the center
 
-    two_sided, one_sided = (stdtrit(freedom, 1 - tail) for tail in (level / 2, level))
-    detects = 1 - below(two_sided) + below(-two_sided) >= POWER
-    # Both one-sided tests must reject. Either one misses with the same probability.
-    excludes = 1 - 2 * below(one_sided) >= POWER
-    difference, equivalence = (
-        int(seeds[enough.argmax()]) if enough.any() else None for enough in (detects, excludes)
-    )
+    def detects(seeds: int) -> bool:
+        low, high = tails(seeds, level / 2)
+        return bool(1 - high + low >= POWER)
+
+    def excludes(seeds: int) -> bool:
+        # Both one-sided tests must reject. Either one misses with the same probability.
+        return bool(1 - 2 * tails(seeds, level)[1] >= POWER)
+
+    counts = range(2, MAX_SEEDS + 1)  # one seed never decides
+    first = [bisect_left(counts, True, key=enough) for enough in (detects, excludes)]
+    difference, equivalence = (counts[at] if at < len(counts) else None for at in first)
     return difference, equivalence
 
 
