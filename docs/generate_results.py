@@ -8,8 +8,8 @@ generator replaces `{{ KIND NAME }}` by a table of the sweep NAME. If tune_confi
 this name, the table has all its runs that any export in docs/results/data has, whichever sweep
 trained them; otherwise it has the runs of the export docs/results/data/NAME. KIND is
 
-- without NAME, over the studies of `summary.STUDIES`: `headline`, `summary`, `sampled`,
-  `exploration` or `robustness`;
+- without NAME, over the studies of `summary.STUDIES`: `headline`, `differences`, `summary`,
+  `sampled`, `exploration` or `robustness`;
 - for a planned study: `answer`, `outcomes` (with stages), `seeds`, `cells`, `figure` (with its
   name), `learning`, `arms`, `peers`, `equal-total`, `hours` or `progress`;
 - for any sweep: `totals` (with a pretrained stage and one from scratch), `runs`, `provenance`,
@@ -40,6 +40,7 @@ from docs.result_pages.studies import (
 )
 from docs.result_pages.success import stage_curves, stages_table, success
 from docs.result_pages.summary import (
+    differences_figure,
     equal_total_text,
     headline,
     sampled_sentence,
@@ -87,6 +88,7 @@ def page(name: str, figures: dict[str, Drawing]) -> str:
     """A page with its tables; adds its figures to `figures`."""
     words: dict[str, Callable[..., str]] = {
         "headline": headline,
+        "differences": lambda: differences_figure(figures),
         "summary": lambda: "\n".join(summary_table()),
         "sampled": sampled_sentence,
         "exploration": lambda: "\n".join(exploration_table()),

@@ -15,9 +15,9 @@ from docs.result_pages.summary import BETWEEN_STAGES, STUDIES, compared, complet
 from music_rllib import names
 from music_rllib.report.figures.choice import Drawing
 from music_rllib.report.figures.draw import files
-from music_rllib.report.figures.plots import METRICS, Style, Subplot, curve_subplot, styles_of
+from music_rllib.report.figures.plots import Style, Subplot, curve_subplot, styles_of
 from music_rllib.results import statistics as st
-from music_rllib.results.analysis import Curve, curve
+from music_rllib.results.analysis import METRICS, Curve, curve
 from music_rllib.results.conditions import Condition, find_stages
 from music_rllib.results.data import Sweep
 from music_rllib.results.scores import with_pretraining

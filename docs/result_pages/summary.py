@@ -7,10 +7,15 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 
+import numpy as np
+from matplotlib.axes import Axes
+
 from docs.result_pages.exports import is_complete, progress_text, sweep_called
 from docs.result_pages.totals import AtEqualTotal, at_equal_total
 from docs.result_pages.words import percent, row, rule
 from music_rllib import names
+from music_rllib.report.figures.choice import Drawing
+from music_rllib.report.figures.plots import Subplot, differences_subplot
 from music_rllib.results.answer import not_excluded, numbers_in_words, verdict_in_words
 from music_rllib.results.claims import Claim, Verdict, claims_of, exploratory
 from music_rllib.results.data import Sweep
@@ -91,6 +96,33 @@ def headline() -> str:
     )
     counts = _counts((claim, str(claim.verdict)) for claim in found)
     return f"**{answer}** Verdicts on {counts}.{open_tasks}"
+
+
+def differences_figure(figures: dict[str, Drawing]) -> str:
+    """The planned comparisons with q = 1 of all studies."""
+    claims = [
+        (f"{claim.task}: {STUDIES[sweep.name]}", claim)
+        for sweep, study in complete_studies()
+        for claim in between_q(compared(study))
+        if claim.second == "q = 1"
+    ]
+    ends = [
+        (claim.contrast.difference.lower, claim.contrast.difference.upper) for _, claim in claims
+    ]
+    subplots: list[Subplot] = []
+    for q in ("q = 1.5", "q = 2"):
+        rows = [("" if subplots else label, claim) for label, claim in claims if claim.first == q]
+        subplot = differences_subplot(f"{q} minus q = 1", rows, "difference of the area")
+
+        def draw(axes: Axes, subplot: Subplot = subplot) -> None:
+            subplot.draw(axes)
+            axes.set_xlim(1.05 * np.min(ends), 1.05 * np.max(ends))
+
+        subplots.append(replace(subplot, draw=draw))
+    figures["differences.svg"] = Drawing(
+        stage="all studies", title="Differences", caption="", subplots=tuple(subplots), legend=[]
+    )
+    return "![Differences of the area between q, with intervals](results/figures/differences.svg)"
 
 
 def sampled_sentence() -> str:

@@ -32,11 +32,11 @@ from music_rllib.report.figures.choice import (
     study_drawings,
 )
 from music_rllib.report.figures.draw import files
-from music_rllib.report.figures.plots import METRICS, Legend, Subplot
+from music_rllib.report.figures.plots import Legend, Subplot
 from music_rllib.report.page import SweepReport, render, runs_table
 from music_rllib.report.two_sweeps import difference_tables
 from music_rllib.report.videos import Videos, make_videos
-from music_rllib.results.analysis import StageAnalysis, analyse, mixed
+from music_rllib.results.analysis import METRICS, StageAnalysis, analyse, mixed
 from music_rllib.results.answer import claim_rows, mean_rows
 from music_rllib.results.conditions import StageRuns
 from music_rllib.results.data import ReportError, Sweep

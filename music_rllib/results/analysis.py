@@ -31,6 +31,32 @@ THRESHOLDS = (0.5, 0.85)
 """Success rates of the times to a threshold; the paper's Figure 4 uses 85%."""
 CURVE_POINTS = 101
 """Largest number of points of a curve in a figure."""
+RATE_LIMITS = (-0.03, 1.03)
+"""Ends of an axis for rates."""
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A metric that has learning curves."""
+
+    name: str
+    title: str
+    axis: str
+    """Label of the axis, with the unit."""
+    limits: tuple[float, float] | None = None
+    target: float | None = None
+
+
+METRICS = (
+    Metric(names.EVAL_SUCCESS, "Success rate", "success rate", RATE_LIMITS, THRESHOLDS[1]),
+    Metric(names.EVAL_RETURN, "Return", "return of an episode"),
+    Metric(names.EVAL_SUCCESS_ANY, "Success at any step", "success at any step", RATE_LIMITS),
+    Metric(names.EVAL_DISPLACEMENT, "Object displacement", "object displacement (m)"),
+    Metric(names.MI_BOUND, "Mutual-information bound", "MI bound (nats)"),
+    Metric(names.MI_REWARD, "Mutual-information reward", "MI reward per step"),
+    Metric(names.ENTROPY, "Tsallis entropy of the policy", "Tsallis entropy"),
+    Metric(names.SHANNON_ENTROPY, "Shannon entropy of the policy", "Shannon entropy (nats)"),
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -10,21 +10,29 @@ from itertools import groupby, product
 
 from music_rllib import names
 from music_rllib.report.figures.plots import (
-    METRICS,
     MOST_BANDS,
     Legend,
-    Metric,
     Style,
     Subplot,
     alpha_subplot,
     curve_subplot,
+    differences_subplot,
     entropy_subplot,
     exploration_subplot,
     finals_subplot,
     profile_subplot,
     styles_of,
 )
-from music_rllib.results.analysis import Curve, FinalScores, Scope, StageAnalysis, curve
+from music_rllib.results.analysis import (
+    METRICS,
+    Curve,
+    FinalScores,
+    Metric,
+    Scope,
+    StageAnalysis,
+    curve,
+)
+from music_rllib.results.claims import Claim
 from music_rllib.results.conditions import ALPHA, Condition, StageRuns, stages_together
 from music_rllib.results.data import Sweep
 from music_rllib.results.statistics import SHOW_SEEDS_BELOW
@@ -56,6 +64,8 @@ MOST_FACETS = 8
 """Largest number of subplots that the curves of one task are spread over."""
 MOST_LINES = 10
 """Largest number of lines in a subplot of the overview."""
+MOST_DIFFERENCES = 20
+"""Largest number of comparisons on a task that have a figure."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -276,9 +286,26 @@ def _styles_by_q(conditions: Sequence[Condition]) -> dict[str, Style]:
 
 
 def study_drawings(study: Study) -> Iterator[Drawing]:
-    """The performance profile of the primary metric, and its dependence on α."""
+    """Differences with intervals, the profile of the primary metric, and its dependence on α."""
     if study.stage is None or not study.means:
         return
+    rows: dict[str, list[tuple[str, Claim]]] = {}
+    for claim in study.claims:
+        if claim.contrast.difference.has_interval:
+            label = f"{claim.first} against {claim.second}"
+            rows.setdefault(claim.task, []).append((label, claim))
+    if rows and max(map(len, rows.values())) <= MOST_DIFFERENCES:
+        yield Drawing(
+            stage=study.stage.name,
+            title="Differences",
+            caption="First condition minus second. Thin lines are 95% CIs, thick lines 90% CIs, "
+            "which must lie in the shaded margin for equivalence.",
+            subplots=tuple(
+                differences_subplot(task, found, f"difference of the {found[0][1].measure.words}")
+                for task, found in rows.items()
+            ),
+            legend=[],
+        )
     styles, kind = styles_of(study.stage.compared), study.means[0].measure.kind_in_words
     shown = {mean.condition: styles[mean.condition] for mean in study.means}
     rates = [mean for mean in study.means if mean.measure.is_rate]

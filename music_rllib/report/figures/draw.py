@@ -134,4 +134,5 @@ def drawn_figure(subplots: Sequence[Subplot], legend: Legend, width: float) -> F
 
 
 def _wrapped(label: str, inches: float) -> str:
-    return textwrap.fill(label, int(_LETTERS_OF_AN_AXIS * inches))
+    lines = (textwrap.fill(line, int(_LETTERS_OF_AN_AXIS * inches)) for line in label.split("\n"))
+    return "\n".join(lines)

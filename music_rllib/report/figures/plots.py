@@ -1,4 +1,4 @@
-"""Subplots of figures: learning curves, final values, profiles, entropies and α.
+"""Subplots of figures: curves, final values, differences, profiles, entropies and α.
 
 A q has the same color in every figure. The values of q that the paper compares have colors of Okabe
 and Ito's palette for color-blind readers, adjusted until each has enough contrast on white and on
@@ -23,7 +23,8 @@ from matplotlib.ticker import EngFormatter, LogFormatter
 
 from music_rllib import names
 from music_rllib.results import statistics as st
-from music_rllib.results.analysis import Curve, FinalScores, Scope
+from music_rllib.results.analysis import RATE_LIMITS, Curve, FinalScores, Metric, Scope
+from music_rllib.results.claims import Claim
 from music_rllib.results.conditions import Condition
 from music_rllib.results.data import Sweep
 from music_rllib.results.scores import measure_on, scores_of
@@ -155,33 +156,6 @@ _LABEL = 26
 """Largest number of letters in a line of a label inside a subplot."""
 MOST_TICKS = 8
 """Largest number of values of α that each have a tick."""
-TARGET = 0.85
-"""Success rate that Figure 4 of the paper waits for."""
-RATE_LIMITS = (-0.03, 1.03)
-
-
-@dataclass(frozen=True)
-class Metric:
-    """A metric that has learning curves."""
-
-    name: str
-    title: str
-    axis: str
-    """Label of the axis, with the unit."""
-    limits: tuple[float, float] | None = None
-    target: float | None = None
-
-
-METRICS = (
-    Metric(names.EVAL_SUCCESS, "Success rate", "success rate", RATE_LIMITS, TARGET),
-    Metric(names.EVAL_RETURN, "Return", "return of an episode"),
-    Metric(names.EVAL_SUCCESS_ANY, "Success at any step", "success at any step", RATE_LIMITS),
-    Metric(names.EVAL_DISPLACEMENT, "Object displacement", "object displacement (m)"),
-    Metric(names.MI_BOUND, "Mutual-information bound", "MI bound (nats)"),
-    Metric(names.MI_REWARD, "Mutual-information reward", "MI reward per step"),
-    Metric(names.ENTROPY, "Tsallis entropy of the policy", "Tsallis entropy"),
-    Metric(names.SHANNON_ENTROPY, "Shannon entropy of the policy", "Shannon entropy (nats)"),
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -266,18 +240,12 @@ def finals_subplot(
     Subplots of the same scope have the same axis.
     """
     is_rate = scope.metric in names.EVAL_RATES
-    rows = [textwrap.fill(labels[final.condition], _LABEL) for final in shown]
-    lines = sum(row.count("\n") + 1.5 for row in rows)
 
     def draw(axes: Axes) -> None:
         scores = np.concatenate([final.scores.ravel() for final in scope.finals])
         # Intervals of two or three returns may be many times as wide as the runs' range.
         room = 0.5 * (np.ptp(scores) or 1.0)
         axes.set_xlim(*(RATE_LIMITS if is_rate else (scores.min() - room, scores.max() + room)))
-        axes.set_ylim(len(shown) - 0.5, -0.5)
-        axes.set_yticks(range(len(shown)), rows)
-        axes.tick_params(axis="y", length=0)
-        axes.grid(visible=False, axis="y")
         for row, final in enumerate(shown):
             color, marker, _ = styles[final.condition]
             runs = final.scores.ravel()
@@ -288,7 +256,41 @@ def finals_subplot(
             axes.plot(final.estimate.value, row, marker, color=color, ms=7)
         axes.set_xlabel("final success rate" if is_rate else f"final {names.word_of(scope.metric)}")
 
-    return Subplot(title=title, draw=draw, height=max(HEIGHT, 1.0 + 0.2 * lines))
+    return _with_rows(title, [labels[final.condition] for final in shown], draw)
+
+
+def differences_subplot(title: str, rows: Sequence[tuple[str, Claim]], axis: str) -> Subplot:
+    """Differences of labelled claims with their 95% and 90% CIs, over the equivalence margin."""
+
+    def draw(axes: Axes) -> None:
+        ink, margin = mpl.rcParams["axes.edgecolor"], rows[0][1].margin
+        axes.axvline(0.0, color=ink, lw=0.8)
+        if margin is not None:
+            axes.axvspan(-margin, margin, color=_UNKNOWN, alpha=0.15, lw=0)
+        for row, (_, claim) in enumerate(rows):
+            color, gap = color_of(claim.pairs[0][0].entropic_index), claim.contrast.difference
+            for one, width in ((gap, 1.5), (claim.contrast.within, 5)):
+                ends = [float(one.lower), float(one.upper)]
+                axes.plot(ends, [row, row], color=color, lw=width, alpha=0.6)
+            axes.plot(float(gap.value), row, marker_of(claim.pairs[0][0].entropic_index), color=ink)
+        axes.set_xlabel(textwrap.fill(axis, _LABEL))  # labels of rows take half of the width
+
+    return _with_rows(title, [label for label, _ in rows], draw)
+
+
+def _with_rows(title: str, labels: Sequence[str], draw: Callable[[Axes], None]) -> Subplot:
+    """A subplot with a labelled row for each of the things that `draw` draws at 0, 1, ..."""
+    rows = [textwrap.fill(label, _LABEL) for label in labels]
+    lines = sum(row.count("\n") + 1.5 for row in rows)
+
+    def whole(axes: Axes) -> None:
+        axes.set_ylim(len(rows) - 0.5, -0.5)
+        axes.set_yticks(range(len(rows)), rows)
+        axes.tick_params(axis="y", length=0)
+        axes.grid(visible=False, axis="y")
+        draw(axes)
+
+    return Subplot(title=title, draw=whole, height=max(HEIGHT, 1.0 + 0.2 * lines))
 
 
 def profile_subplot(task: str, means: Sequence[Mean], styles: Styles) -> Subplot:

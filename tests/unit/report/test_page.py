@@ -18,6 +18,7 @@ from xml.etree import ElementTree
 import matplotlib as mpl
 import numpy as np
 import pytest
+import scipy.stats
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 
@@ -248,6 +249,26 @@ def test_final_entropies_are_in_a_table_and_a_figure() -> None:
     areas = [0.505 * final for final in (0.5, 0.6, 0.7, 0.4, 0.5, 0.6)]
     expected = sorted(zip(values, areas, strict=True))
     np.testing.assert_allclose(points, expected, rtol=1e-6)
+
+
+def test_differences_have_their_intervals_and_the_margin() -> None:
+    report = build_report(compared({"1": LOW, "1.5": HIGH}))
+    (drawing,) = [one for one in report.drawings if one.title == "Differences"]
+    axes = drawn_figure(drawing.subplots, drawing.legend, TEXT_WIDTH).axes[0]
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["q = 1.5 against q = 1"]
+    gaps = 0.505 * (np.array(HIGH) - LOW)  # as above
+    zero, *ends, point = (np.asarray(line.get_xdata(), float) for line in axes.lines)
+    assert (zero.tolist(), point) == ([0.0, 0.0], pytest.approx(gaps.mean()))
+    for level, found in zip((0.95, 0.9), ends, strict=True):
+        interval = scipy.stats.t.interval(level, len(gaps) - 1, gaps.mean(), scipy.stats.sem(gaps))
+        np.testing.assert_allclose(found, interval)
+    (margin,) = axes.patches
+    box = margin.get_extents().transformed(axes.transData.inverted())
+    np.testing.assert_allclose([box.x0, box.x1], [-0.05, 0.05])
+    figure = drawn_figure(drawing.subplots, [], 4.3)
+    figure.draw_without_rendering()
+    label = figure.axes[0].xaxis.label.get_window_extent()
+    assert 0 <= label.x0 < label.x1 <= figure.bbox.x1
 
 
 def test_exploration_is_that_of_training_episodes_in_the_first_quarter() -> None:
@@ -533,7 +554,7 @@ def test_the_primary_metric_of_a_task_without_success_is_the_return() -> None:
     assert "No evaluation yet" not in shown.text
     assert "q = 1.5 against q = 1 on Reacher: superior" in shown.text
     drawn = {drawing.title: drawing for drawing in report.drawings}
-    assert list(drawn) == ["Return", "Final return"]
+    assert list(drawn) == ["Return", "Final return", "Differences"]
     assert "return of an episode" in page
     assert {row["metric"] for row in curve_rows(report)} == {names.EVAL_RETURN}
     assert not report.analyses[0].times, "the task has no success rate"
