@@ -47,7 +47,8 @@ def token(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def load(name: str) -> Any:
     """A file in which the user has entered a profile."""
-    return yaml.safe_load((CLUSTER / name).read_text().replace("CHANGE-ME", "mine"))
+    text = (CLUSTER / name).read_text().replace("CHANGE-ME", "mine")
+    return yaml.load(text, yaml.CSafeLoader)  # ten times as fast as `safe_load`
 
 
 @pytest.mark.parametrize("name", [name for name in ALL if name not in {"onprem.yaml", "aws.yaml"}])
