@@ -281,8 +281,8 @@ def test_sensitivity_to_alpha_has_a_line_for_each_q(rng: np.random.Generator) ->
     ]
     values = [float(mean.estimate.value) for _, mean in lines[0]]
     np.testing.assert_allclose(values, [0.1, 0.2, 0.3], atol=0.04)
-    profile, area = study_drawings(found)
-    assert [len(drawing.subplots) for drawing in (profile, area)] == [1, 1]
+    differences, profile, area = study_drawings(found)
+    assert [len(drawing.subplots) for drawing in (differences, profile, area)] == [1, 1, 1]
     assert [label for label, _ in area.legend] == ["q = 1", "q = 1.5"]
     assert files(area.subplots, area.legend)
     comparisons, means = study_tables(found)
