@@ -289,23 +289,7 @@ def study_drawings(study: Study) -> Iterator[Drawing]:
     """Differences with intervals, the profile of the primary metric, and its dependence on α."""
     if study.stage is None or not study.means:
         return
-    rows: dict[str, list[tuple[str, Claim]]] = {}
-    for claim in study.claims:
-        if claim.contrast.difference.has_interval:
-            label = f"{claim.first} against {claim.second}"
-            rows.setdefault(claim.task, []).append((label, claim))
-    if rows and max(map(len, rows.values())) <= MOST_DIFFERENCES:
-        yield Drawing(
-            stage=study.stage.name,
-            title="Differences",
-            caption="First condition minus second. Thin lines are 95% CIs, thick lines 90% CIs, "
-            "which must lie in the shaded margin for equivalence.",
-            subplots=tuple(
-                differences_subplot(task, found, f"difference of the {found[0][1].measure.words}")
-                for task, found in rows.items()
-            ),
-            legend=[],
-        )
+    yield from _differences(study, study.stage.name)
     styles, kind = styles_of(study.stage.compared), study.means[0].measure.kind_in_words
     shown = {mean.condition: styles[mean.condition] for mean in study.means}
     rates = [mean for mean in study.means if mean.measure.is_rate]
@@ -337,6 +321,27 @@ def study_drawings(study: Study) -> Iterator[Drawing]:
                 for task, found in groupby(drawn, lambda pair: pair[0][0][1].task)
             ),
             legend=[(condition.short_label, style) for condition, style in of_lines.items()],
+        )
+
+
+def _differences(study: Study, stage: str) -> Iterator[Drawing]:
+    """The comparisons that answer the question of a study."""
+    rows: dict[str, list[tuple[str, Claim]]] = {}
+    for claim in study.claims:
+        if claim.contrast.difference.has_interval:
+            label = f"{claim.first} against {claim.second}"
+            rows.setdefault(claim.task, []).append((label, claim))
+    if rows and max(map(len, rows.values())) <= MOST_DIFFERENCES:
+        yield Drawing(
+            stage=stage,
+            title="Differences",
+            caption="First condition minus second. Thin lines are 95% CIs, thick lines 90% CIs, "
+            "which must lie in the shaded margin for equivalence.",
+            subplots=tuple(
+                differences_subplot(task, found, f"difference of the {found[0][1].measure.words}")
+                for task, found in rows.items()
+            ),
+            legend=[],
         )
 
 

@@ -268,11 +268,11 @@ def differences_subplot(title: str, rows: Sequence[tuple[str, Claim]], axis: str
         if margin is not None:
             axes.axvspan(-margin, margin, color=_UNKNOWN, alpha=0.15, lw=0)
         for row, (_, claim) in enumerate(rows):
-            color, gap = color_of(claim.pairs[0][0].entropic_index), claim.contrast.difference
+            q, gap = claim.pairs[0][0].entropic_index, claim.contrast.difference
             for one, width in ((gap, 1.5), (claim.contrast.within, 5)):
                 ends = [float(one.lower), float(one.upper)]
-                axes.plot(ends, [row, row], color=color, lw=width, alpha=0.6)
-            axes.plot(float(gap.value), row, marker_of(claim.pairs[0][0].entropic_index), color=ink)
+                axes.plot(ends, [row, row], color=color_of(q), lw=width, alpha=0.6)
+            axes.plot(float(gap.value), row, marker_of(q), color=ink)
         axes.set_xlabel(textwrap.fill(axis, _LABEL))  # labels of rows take half of the width
 
     return _with_rows(title, [label for label, _ in rows], draw)
