@@ -5,7 +5,9 @@ Shape legend: S flat numbers of P parameters.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from inspect import unwrap
 from typing import Any, NamedTuple
 
@@ -120,6 +122,21 @@ def adam_step(step: AdamStep) -> None:
         means[i] += share * (gradient - means[i])
         squares[i] = kept * squares[i] + fresh * gradient * gradient
         values[i] -= step_size * means[i] / (np.sqrt(squares[i]) * correction + eps)
+
+
+@contextmanager
+def flushed_denormals() -> Iterator[None]:
+    """Round results below the smallest normal number to 0, in this thread.
+
+    The moments of a parameter whose gradient stays 0, as of a dead unit, decay to such numbers.
+    Intel's CPUs take 30 times as long for a step of Adam if a tenth of all moments are denormal.
+    """
+    was_on = sys.float_info.min / 2 == 0.0
+    torch.set_flush_denormal(True)
+    try:
+        yield
+    finally:
+        torch.set_flush_denormal(was_on)
 
 
 class FusedAdam(torch.optim.Adam):

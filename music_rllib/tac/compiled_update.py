@@ -18,7 +18,7 @@ from ray.rllib.core.columns import Columns
 from torch import Tensor, nn
 
 from music_rllib import names
-from music_rllib.kernels.adam import AdamStep, FlatParameters, FusedAdam
+from music_rllib.kernels.adam import AdamStep, FlatParameters, FusedAdam, flushed_denormals
 from music_rllib.kernels.blas import use_threads
 from music_rllib.kernels.distribution import Distribution
 from music_rllib.kernels.layers import Array, Network, Normalized
@@ -26,7 +26,9 @@ from music_rllib.kernels.update import AlphaStep, Averages, Batch, Networks, Upd
 from music_rllib.tac.networks import Critics, Perceptron, RunningNormaliser
 from music_rllib.tac.rl_module import EstimatorModule, TACModule
 
-__all__ = ["CompiledUpdate", "FusedAdam", "Learned", "needs_autograd", "use_threads"]
+__all__ = [
+    "CompiledUpdate", "FusedAdam", "Learned", "flushed_denormals", "needs_autograd", "use_threads",
+]  # fmt: skip
 
 HOOKS = (
     "configure_optimizers", "configure_optimizers_for_module", "compute_losses",

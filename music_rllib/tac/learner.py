@@ -34,7 +34,13 @@ from music_rllib.runtime.process import keep_freed_memory, use_reproducible_gpu_
 from music_rllib.runtime.quiet import quiet_third_parties
 from music_rllib.schedules import Quantity
 from music_rllib.tac import diagnostics
-from music_rllib.tac.compiled_update import CompiledUpdate, FusedAdam, needs_autograd, use_threads
+from music_rllib.tac.compiled_update import (
+    CompiledUpdate,
+    FusedAdam,
+    flushed_denormals,
+    needs_autograd,
+    use_threads,
+)
 from music_rllib.tac.diagnostics import FreshEpisodes, critic_bias
 from music_rllib.tac.losses import Losses, ScheduledSettings, TACLoss
 from music_rllib.tac.minibatches import INTRINSIC, STORED, Minibatch, Minibatches
@@ -163,7 +169,9 @@ class TACLearner(TorchLearner):
         minibatches = self._minibatches(self._convert_batch_type(batch))
         if minibatches.updates:
             learn = self._learn_by_autograd if self._compiled is None else self._learn_compiled
-            self._log_updates(learn(minibatches))
+            with flushed_denormals():
+                learned = learn(minibatches)
+            self._log_updates(learned)
         self.after_gradient_based_update(timesteps=timesteps or {})
         return self.metrics.reduce()
 
