@@ -384,6 +384,23 @@ def test_updates_without_own_methods_are_compiled() -> None:
     assert compiled_of(build(grad_clip=1.0)) is None
 
 
+@pytest.mark.parametrize("settings", [{}, {"grad_clip": 1.0}], ids=["compiled", "autograd"])
+def test_updates_compute_without_denormals(settings: dict[str, Any]) -> None:
+    """Intel's CPUs are slow with them; the moments of dead units decay to them and stay there."""
+    algo = build(**settings)
+    while not algo.grad_updates:
+        algo.train()
+    state = algo.learner_group._learner._adam["networks"].state
+    moments = [s[name] for s in state.values() for name in ("exp_avg", "exp_avg_sq")]
+    smallest, tiny = torch.finfo(torch.float32).smallest_normal, 1e-40
+    for values in moments:
+        values[values.abs() < smallest] = tiny
+    assert any((values == tiny).any() for values in moments)
+    algo.train()
+    assert not any(((values != 0) & (values.abs() < smallest)).any() for values in moments)
+    assert torch.tensor(smallest) / 2 > 0  # the caller's arithmetic is not changed
+
+
 def test_learning_rates_of_rllibs_schedulers_are_used() -> None:
     config = TACConfig().environment("FetchReach-v4").training(**SMALL)
     config.reporting(min_sample_timesteps_per_iteration=1)
