@@ -145,7 +145,8 @@ class Probe:
             )
         if self._hindsight and not goal:
             self.problems.append(
-                "must have goals for replay.hindsight_k > 0, its observations have none"
+                "must have goals for replay.hindsight_k > 0, its observations have none; "
+                "replay: {hindsight_k: 0} turns hindsight off, which some presets turn on"
             )
         smallest, largest = task.seed_range
         self._try_seeds(env, smallest, largest)
