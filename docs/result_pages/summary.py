@@ -16,8 +16,16 @@ from docs.result_pages.words import percent, row, rule
 from music_rllib import names
 from music_rllib.report.figures.choice import Drawing
 from music_rllib.report.figures.plots import Subplot, differences_subplot
+from music_rllib.results import statistics as st
 from music_rllib.results.answer import not_excluded, numbers_in_words, verdict_in_words
-from music_rllib.results.claims import Claim, Verdict, claims_of, exploratory
+from music_rllib.results.claims import (
+    Claim,
+    Contrast,
+    Verdict,
+    claims_of,
+    contrast,
+    exploratory,
+)
 from music_rllib.results.data import Sweep
 from music_rllib.results.scores import counted
 from music_rllib.results.study import Study, study_of
@@ -41,6 +49,8 @@ PAPER = {
     ("FetchPickAndPlace", "q = 1.5", "q = 1"): "Figure 5: better",
     ("FetchSlide", "q = 1.5", "q = 1"): "Figure 6: comparable; text: better",
 }
+COMPARED = ("q = 1.5", "q = 2")
+"""Values that are compared with q = 1."""
 BETWEEN_STAGES = "stage = "
 """Start of the labels of a comparison of two stages."""
 
@@ -95,7 +105,28 @@ def headline() -> str:
         f" No comparison of q is decided on {' and '.join(undecided)}." if undecided else ""
     )
     counts = _counts((claim, str(claim.verdict)) for claim in found)
-    return f"**{answer}** Verdicts on {counts}.{open_tasks}"
+    return f"**{answer}** Verdicts on {counts}.{open_tasks}{_averages(found)}"
+
+
+def average(claims: Sequence[Claim]) -> Contrast:
+    """The mean difference of studies. Each counts once; the spread between them is the error."""
+    gaps = np.array([float(claim.contrast.difference.value) for claim in claims])
+    return contrast(gaps, 0.0 * gaps, paired=True)
+
+
+def _averages(claims: Sequence[Claim]) -> str:
+    """The average over studies of each q against q = 1; empty if they are few."""
+    of_q = {q: [c for c in claims if (c.first, c.second) == (q, "q = 1")] for q in COMPARED}
+    count = min(map(len, of_q.values()))
+    if count < st.FEWEST_FOR_INTERVAL:
+        return ""
+    gaps = ((q, average(own).difference) for q, own in of_q.items())
+    parts = (
+        f"{q} minus q = 1, {g.value:+.2f} (95% CI {g.lower:.2f} to {g.upper:.2f})" for q, g in gaps
+    )
+    return (
+        f" Mean difference of the area over the {count} settings (not planned): {'; '.join(parts)}."
+    )
 
 
 def differences_figure(figures: dict[str, Drawing]) -> str:
@@ -110,8 +141,11 @@ def differences_figure(figures: dict[str, Drawing]) -> str:
         (claim.contrast.difference.lower, claim.contrast.difference.upper) for _, claim in claims
     ]
     subplots: list[Subplot] = []
-    for q in ("q = 1.5", "q = 2"):
-        rows = [("" if subplots else label, claim) for label, claim in claims if claim.first == q]
+    for q in COMPARED:
+        own = [(label, claim) for label, claim in claims if claim.first == q]
+        (_, last), contrasts = own[-1], average([claim for _, claim in own])
+        own.append(("mean of all settings", replace(last, contrast=contrasts)))
+        rows = [("" if subplots else label, claim) for label, claim in own]
         subplot = differences_subplot(f"{q} minus q = 1", rows, "difference of the area")
 
         def draw(axes: Axes, subplot: Subplot = subplot) -> None:
@@ -127,13 +161,18 @@ def differences_figure(figures: dict[str, Drawing]) -> str:
 
 def sampled_sentence() -> str:
     """How many comparisons of two q by the sampled policy have a CI that excludes 0."""
+    claims = [
+        claim for sweep, study in complete_studies() for claim in between_q(sampled(sweep, study))
+    ]
     counts = _counts(
         (claim, "above 0" if gap.lower > 0 else "below 0" if gap.upper < 0 else "include 0")
-        for sweep, study in complete_studies()
-        for claim in between_q(sampled(sweep, study))
+        for claim in claims
         for gap in [claim.contrast.difference]
     )
-    return f"95% intervals of the sampled policy (exploratory, not adjusted) for {counts}."
+    return (
+        f"95% intervals of the sampled policy (exploratory, not adjusted) for {counts}."
+        f"{_averages(claims)}"
+    )
 
 
 def _counts(results: Iterable[tuple[Claim, str]]) -> str:

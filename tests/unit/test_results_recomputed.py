@@ -224,6 +224,21 @@ def test_every_row_of_the_summary() -> None:
     ]
 
 
+@pytest.mark.parametrize(("metric", "after"), [(MEAN, "# Results"), (SAMPLED, "How to read")])
+def test_the_averages_over_settings(metric: str, after: str) -> None:
+    """Each setting's difference is one observation."""
+    found = []
+    for q in ("1.5", "2"):
+        pairs = [[areas(*each, of, metric) for of in (q, "1")] for each in STUDIES.values()]
+        gaps = [compared(*pair)["difference"] for pair in pairs]
+        ends = stats.t.interval(0.95, len(gaps) - 1, np.mean(gaps), stats.sem(gaps))
+        interval = f"{ends[0]:.2f} to {ends[1]:.2f}"
+        found.append(f"q = {q} minus q = 1, {np.mean(gaps):+.2f} (95% CI {interval})")
+    text = f"Mean difference of the area over the {len(STUDIES)} settings (not planned): "
+    line = next(one for one in PAGE[PAGE.index(after) :].splitlines() if text in one)
+    assert f"{text}{'; '.join(found)}." in line
+
+
 def test_the_verdicts_at_several_alphas() -> None:
     """Planned comparisons of the factorial, in the order of its plan."""
     pairs = (("1.5", "1"), ("2", "1"), ("2", "1.5"))
@@ -380,7 +395,12 @@ def test_every_figure_of_the_readme_is_on_the_page() -> None:
     section = readme[readme.index("## Results") : readme.index("## In your own")]
     verdicts = "worse|undecided|superior|equivalent within 0.05"
     found = re.findall(rf"({verdicts}), ([+-]\d\.\d\d \(9[05]% CI [\d.-]+ to [\d.-]+)\)", section)
-    assert 3 <= len(found) == section.count("% CI")
+    numbers_of = r"([+-]\d\.\d\d \(9[05]% CI [\d.-]+ to [\d.-]+\))"
+    averages = re.findall(rf"\sby {numbers_of}", section)
+    assert 3 <= len(found) == section.count("% CI") - len(averages)
+    assert averages == re.findall(
+        rf"minus q = 1, {numbers_of}", PAGE[: PAGE.index("The paper (Kim")]
+    )
     for verdict, numbers in found:
         assert f"**{verdict}**, {numbers};" in PAGE
     for percent in re.findall(r"\d+%(?! CI)", section):
