@@ -83,7 +83,7 @@ def between_q(claims: Sequence[Claim]) -> list[Claim]:
 
 
 def headline() -> str:
-    """Whether q = 1.5 is better than q = 1 anywhere, and the number of each verdict."""
+    """Whether q = 1.5 is better than q = 1 anywhere, counts of verdicts, and mean differences."""
     claims = [
         (STUDIES[sweep.name], claim)
         for sweep, study in complete_studies()
