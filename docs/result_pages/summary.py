@@ -143,8 +143,8 @@ def differences_figure(figures: dict[str, Drawing]) -> str:
     subplots: list[Subplot] = []
     for q in COMPARED:
         own = [(label, claim) for label, claim in claims if claim.first == q]
-        (_, last), contrasts = own[-1], average([claim for _, claim in own])
-        own.append(("mean of all settings", replace(last, contrast=contrasts)))
+        mean = replace(own[-1][1], contrast=average([claim for _, claim in own]))
+        own.append(("mean of all settings", mean))
         rows = [("" if subplots else label, claim) for label, claim in own]
         subplot = differences_subplot(f"{q} minus q = 1", rows, "difference of the area")
 
