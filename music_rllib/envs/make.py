@@ -167,7 +167,7 @@ def compute_reward_of(env: Env) -> GoalReward | None:
         return None
 
     def reward(achieved: NDArray[np.float32], desired: NDArray[np.float32]) -> NDArray[Any]:
-        rewards = np.asarray(compute(achieved, desired, {}), dtype=np.float32)
+        rewards = np.asarray(compute(np.array(achieved), np.array(desired), {}), np.float32)
         if not are_usable(rewards.ravel()):
             try:
                 check_numbers("compute_reward", rewards.ravel())

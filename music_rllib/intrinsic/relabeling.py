@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -60,8 +60,10 @@ def checked_class(settings: IntrinsicSettings) -> type[IntrinsicReward]:
     return kind
 
 
-def make_reward(settings: IntrinsicSettings, sizes: Sizes, seed: int) -> IntrinsicReward:
-    """A reward with initial weights that depend on the seed only.
+def make_reward(
+    settings: IntrinsicSettings, sizes: Sizes, seed: int, device: torch.device | None = None
+) -> IntrinsicReward:
+    """A reward on a device, with initial weights that depend on the seed only.
 
     Raises:
         ValueError: The class, its settings or the environment do not fit.
@@ -72,7 +74,7 @@ def make_reward(settings: IntrinsicSettings, sizes: Sizes, seed: int) -> Intrins
         reward = kind(sizes, **settings.settings)
     if getattr(reward, "sums", None) is None:
         raise ValueError(f"{settings.reward} must call super().__init__(sizes) in its __init__")
-    return reward
+    return reward.to(device)
 
 
 PERIOD = 4
@@ -89,10 +91,16 @@ class RewardLearner:
         reward: on its device.
         lr: Adam's step size.
         frozen: do not train the networks.
+        again: makes the same reward again, for a check of a user's class before its first update;
+            None: no check.
     """
 
-    def __init__(self, reward: IntrinsicReward, lr: float, *, frozen: bool) -> None:
+    def __init__(
+        self, reward: IntrinsicReward, lr: float, *, frozen: bool,
+        again: Callable[[], IntrinsicReward] | None = None,
+    ) -> None:  # fmt: skip
         self.reward, self._frozen, self._updates = reward, frozen, 0
+        self._again = again and (lambda: RewardLearner(again(), lr, frozen=frozen))
         self._parameters = [each for each in reward.parameters() if each.requires_grad]
         self._loss = reward.sums.new_zeros((), dtype=torch.float32)
         """[] loss of the last step."""
@@ -133,7 +141,12 @@ class RewardLearner:
 
         Returns:
             [K, B] rewards in [-1, 0], each minibatch's before its update, and metrics [K] by name.
+
+        Raises:
+            ValueError: A method of the class returned or did something that it must not.
         """
+        if self._again is not None and not self._updates:
+            _check_on(_part(batch, 0, updates), self._again)
         rewards, bonuses, losses = [], [], []
         for k in range(updates):
             part = _part(batch, k, updates)
@@ -221,6 +234,40 @@ class RewardLearner:
             }
             groups = self._adam.state_dict()["param_groups"]
             self._adam.load_state_dict({"state": moments, "param_groups": groups})
+
+
+def _check_on(batch: Batch, make: Callable[[], RewardLearner]) -> None:
+    """Check that a user's reward leaves a minibatch as it is, and resumes exactly.
+
+    Otherwise the critics would learn from changed data, and a resumed run would differ, both
+    without an error.
+
+    Raises:
+        ValueError: It does not.
+    """
+
+    def learned(learner: RewardLearner) -> Tensor:
+        """[PERIOD, B] rewards of updates, one of which is followed by a step of the networks."""
+        own = Batch(*(each.clone() if isinstance(each, Tensor) else each for each in batch))
+        generator = torch.Generator(batch.states.device).manual_seed(0)
+        own = own._replace(generator=generator)
+        rewards = torch.cat([learner.learn(own, 1)[0] for _ in range(PERIOD)])
+        for name, given, left in zip(Batch._fields, batch, own, strict=True):
+            if isinstance(given, Tensor) and not torch.equal(given, left):
+                kind = type(learner.reward).__name__
+                raise ValueError(f"{kind} must not change the {name} of its batch in place")
+        return rewards
+
+    with torch.random.fork_rng(devices=[]):
+        first, resumed = make(), make()
+        learned(first)
+        resumed.load_state(first.state())
+        if not torch.equal(learned(first), learned(resumed)):
+            raise ValueError(
+                f"{type(first.reward).__name__} must keep everything that changes in parameters "
+                "and buffers, and take random numbers from batch.generator: its rewards differ "
+                "after a checkpoint is loaded"
+            )
 
 
 def _part(batch: Batch, k: int, updates: int) -> Batch:

@@ -88,8 +88,9 @@ class TACLearner(TorchLearner):
         if (intrinsic := settings.intrinsic).reward is not None:
             observation, goal = observation_sizes(self._policy_module.observation_space)
             sizes = Sizes(observation, goal, actions, *dict(settings.split).values())
-            reward = make_reward(intrinsic, sizes, seed + 4241).to(self._device)
-            self.bonus = RewardLearner(reward, intrinsic.lr, frozen=intrinsic.frozen)
+            make = functools.partial(make_reward, intrinsic, sizes, seed + 4241, self._device)
+            again = make if intrinsic.own_module else None
+            self.bonus = RewardLearner(make(), intrinsic.lr, frozen=intrinsic.frozen, again=again)
 
     @cached_property
     def _music(self) -> Music:

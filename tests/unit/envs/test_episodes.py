@@ -220,3 +220,15 @@ def test_an_additional_cost_of_actions_is_found() -> None:
     goal_reward_of(Reach(0.0))
     with pytest.raises(ValueError, match="must be 0 if compute_reward is not the whole reward"):
         goal_reward_of(Reach(0.5))
+
+
+def test_a_reward_that_changes_its_arguments_does_not_change_the_replay() -> None:
+    class InPlace(Reach):
+        def compute_reward(self, achieved: Floats, desired: Floats, info: Any) -> Floats:
+            desired -= achieved
+            return sparse(desired, np.zeros_like(desired))
+
+    reward = goal_reward_of(InPlace(0.0))
+    kept = np.ones((3, 2), np.float32)
+    np.testing.assert_array_equal(reward(kept, kept), reward(kept[:1], kept))
+    np.testing.assert_array_equal(kept, 1)

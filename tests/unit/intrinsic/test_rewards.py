@@ -1,5 +1,6 @@
 """Intrinsic rewards other than MUSIC's: an oracle for each, their scale, exact resume."""
 
+import functools
 import importlib
 import inspect
 import math
@@ -259,6 +260,100 @@ def test_a_result_that_does_not_fit_is_refused_instead_of_broadcast(
 
     with pytest.raises(ValueError, match=message):
         use()
+
+
+class InPlace(Speed):
+    def bonus(self, batch: Batch) -> Tensor:
+        moved = batch.followers
+        moved -= batch.states
+        return moved.norm(dim=-1)
+
+
+class InPlaceLoss(Unusual):
+    trajectories = 0
+
+    def loss(self, batch: Batch) -> Tensor:
+        return (batch.actions.clamp_(0.0).sum() - self.center).square().mean()
+
+
+class Counting(Speed):
+    """Its attribute is in no checkpoint."""
+
+    seen = 0
+
+    def bonus(self, batch: Batch) -> Tensor:
+        self.seen += 1
+        return super().bonus(batch) / self.seen
+
+
+class GlobalNoise(Speed):
+    def bonus(self, batch: Batch) -> Tensor:
+        return torch.rand(len(batch.states))
+
+
+class Drawn(Speed):
+    """Its constructor takes random numbers that no seed determines."""
+
+    def __init__(self, sizes: Sizes) -> None:
+        super().__init__(sizes)
+        self.factor = float(np.random.default_rng().random())
+
+    scale = 100.0
+
+
+class OwnOptimizer(Unusual):
+    """Trains its parameter itself; the optimizer's momentum is in no checkpoint."""
+
+    trajectories = 0
+
+    def __init__(self, sizes: Sizes) -> None:
+        super().__init__(sizes)
+        self.optimizer = torch.optim.SGD([self.center], 0.1, momentum=0.9)
+
+    def bonus(self, batch: Batch) -> Tensor:
+        with torch.enable_grad():
+            (batch.followers - self.center).square().mean().backward()
+        self.optimizer.step()
+        return super().bonus(batch)
+
+    def loss(self, batch: Batch) -> None:  # type: ignore[override]
+        return None
+
+
+def own(kind: type[IntrinsicReward], *, frozen: bool = False) -> RewardLearner:
+    make = functools.partial(kind, SIZES)
+    return RewardLearner(make(), 1e-3, frozen=frozen, again=make)
+
+
+@pytest.mark.parametrize(
+    ("kind", "rule"),
+    [
+        (InPlace, "must not change the followers of its batch in place"),
+        (InPlaceLoss, "must not change the actions of its batch in place"),
+        (Counting, "keep everything that changes in parameters and buffers"),
+        (GlobalNoise, r"take random numbers from batch\.generator"),
+        (Drawn, "keep everything"),
+        (OwnOptimizer, "keep everything"),
+    ],
+)
+def test_a_reward_that_would_change_data_or_not_resume_is_refused(kind: Any, rule: str) -> None:
+    with pytest.raises(ValueError, match=f"^{kind.__name__} .*{rule}"):
+        own(kind).learn(batch(128), 2)
+
+
+@pytest.mark.parametrize("frozen", [False, True])
+@pytest.mark.parametrize("kind", [Speed, Unusual])
+def test_the_check_of_a_reward_changes_no_result(kind: Any, frozen: bool) -> None:
+    shown = {"trajectories": torch.randn(2 * kind.trajectories, 4, 6)}
+    checked, plain = own(kind, frozen=frozen), RewardLearner(kind(SIZES), 1e-3, frozen=frozen)
+    torch.manual_seed(3)
+    rewards = checked.learn(batch(128, **shown), 2)[0]
+    state = torch.get_rng_state()
+    torch.manual_seed(3)
+    assert torch.equal(plain.learn(batch(128, **shown), 2)[0], rewards)
+    assert torch.equal(state, torch.get_rng_state())
+    for name, weights in plain.weights().items():
+        np.testing.assert_array_equal(weights, checked.weights()[name])
 
 
 @pytest.mark.parametrize("name", ["alpha", "intrinsic/reward"])
