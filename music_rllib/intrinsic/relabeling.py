@@ -100,7 +100,9 @@ class RewardLearner:
         again: Callable[[], IntrinsicReward] | None = None,
     ) -> None:  # fmt: skip
         self.reward, self._frozen, self._updates = reward, frozen, 0
-        self._again = again and (lambda: RewardLearner(again(), lr, frozen=frozen))
+        self._again: Callable[[], RewardLearner] | None = None
+        if again is not None:
+            self._again = lambda: RewardLearner(again(), lr, frozen=frozen)
         self._parameters = [each for each in reward.parameters() if each.requires_grad]
         self._loss = reward.sums.new_zeros((), dtype=torch.float32)
         """[] loss of the last step."""
@@ -248,12 +250,13 @@ def _check_on(batch: Batch, make: Callable[[], RewardLearner]) -> None:
 
     def learned(learner: RewardLearner) -> Tensor:
         """[PERIOD, B] rewards of updates, one of which is followed by a step of the networks."""
-        own = Batch(*(each.clone() if isinstance(each, Tensor) else each for each in batch))
+        given = {k: each for k, each in batch._asdict().items() if isinstance(each, Tensor)}
+        copies = {name: each.clone() for name, each in given.items()}
         generator = torch.Generator(batch.states.device).manual_seed(0)
-        own = own._replace(generator=generator)
+        own = batch._replace(generator=generator, **copies)
         rewards = torch.cat([learner.learn(own, 1)[0] for _ in range(PERIOD)])
-        for name, given, left in zip(Batch._fields, batch, own, strict=True):
-            if isinstance(given, Tensor) and not torch.equal(given, left):
+        for name, each in given.items():
+            if not torch.equal(each, copies[name]):
                 kind = type(learner.reward).__name__
                 raise ValueError(f"{kind} must not change the {name} of its batch in place")
         return rewards

@@ -266,7 +266,7 @@ class InPlace(Speed):
     def bonus(self, batch: Batch) -> Tensor:
         moved = batch.followers
         moved -= batch.states
-        return moved.norm(dim=-1)
+        return moved.abs().sum(-1)
 
 
 class InPlaceLoss(Unusual):
@@ -344,7 +344,7 @@ def test_a_reward_that_would_change_data_or_not_resume_is_refused(kind: Any, rul
 @pytest.mark.parametrize("frozen", [False, True])
 @pytest.mark.parametrize("kind", [Speed, Unusual])
 def test_the_check_of_a_reward_changes_no_result(kind: Any, frozen: bool) -> None:
-    shown = {"trajectories": torch.randn(2 * kind.trajectories, 4, 6)}
+    shown: Any = {"trajectories": torch.randn(2 * kind.trajectories, 4, 6)}
     checked, plain = own(kind, frozen=frozen), RewardLearner(kind(SIZES), 1e-3, frozen=frozen)
     torch.manual_seed(3)
     rewards = checked.learn(batch(128, **shown), 2)[0]
