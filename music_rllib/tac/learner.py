@@ -45,6 +45,7 @@ from music_rllib.tac.diagnostics import FreshEpisodes, critic_bias
 from music_rllib.tac.losses import Losses, ScheduledSettings, TACLoss
 from music_rllib.tac.minibatches import INTRINSIC, STORED, Minibatch, Minibatches
 from music_rllib.tac.networks import RunningNormaliser
+from music_rllib.tac.random_state import generator_states, set_generators
 from music_rllib.tac.rl_module import ESTIMATOR_MODULE, TACForward, TACModule, mean_values
 
 GRAD_UPDATES = "grad_updates"
@@ -389,7 +390,7 @@ class TACLearner(TorchLearner):
     def get_state(self, *args: Any, **kwargs: Any) -> StateDict:
         state = super().get_state(*args, **kwargs)
         state["tac"] = {
-            "generator": self._generator.get_state().numpy(),
+            **generator_states(self._generator),
             GRAD_UPDATES: self._grad_updates,
             "held_out": self._music.state(),
             "scheduled": self._now.state(),
@@ -404,15 +405,8 @@ class TACLearner(TorchLearner):
         super().set_state(state)
         if "tac" in state:
             self._grad_updates = int(state["tac"][GRAD_UPDATES])
-            self._set_generator(torch.tensor(state["tac"]["generator"]))
+            set_generators(self._generator, state["tac"], self._grad_updates)
             self._music.load_state(state["tac"]["held_out"])
             self._now.load_state(state["tac"]["scheduled"])
             if self.bonus is not None and "intrinsic" in state["tac"]:
                 self.bonus.load_state(state["tac"]["intrinsic"])
-
-    def _set_generator(self, state: Tensor) -> None:
-        """Continue the random numbers of a state, or begin others if a GPU and a CPU are mixed."""
-        if len(state) == len(self._generator.get_state()):
-            self._generator.set_state(state)
-        else:
-            self._generator.manual_seed(self._generator.initial_seed() + self._grad_updates)

@@ -286,9 +286,16 @@ class Counting(Speed):
         return super().bonus(batch) / self.seen
 
 
-class GlobalNoise(Speed):
+class NumpyNoise(Speed):
     def bonus(self, batch: Batch) -> Tensor:
-        return torch.rand(len(batch.states))
+        return torch.from_numpy(np.random.default_rng().random(len(batch.states)))
+
+
+class Dropout(Speed):
+    """It draws from PyTorch's own generator, whose state is in checkpoints."""
+
+    def bonus(self, batch: Batch) -> Tensor:
+        return torch.nn.functional.dropout(super().bonus(batch), 0.2)
 
 
 class Drawn(Speed):
@@ -331,7 +338,7 @@ def own(kind: type[IntrinsicReward], *, frozen: bool = False) -> RewardLearner:
         (InPlace, "must not change the followers of its batch in place"),
         (InPlaceLoss, "must not change the actions of its batch in place"),
         (Counting, "keep everything that changes in parameters and buffers"),
-        (GlobalNoise, r"take random numbers from batch\.generator"),
+        (NumpyNoise, r"take random numbers from batch\.generator"),
         (Drawn, "keep everything"),
         (OwnOptimizer, "keep everything"),
     ],
@@ -342,7 +349,7 @@ def test_a_reward_that_would_change_data_or_not_resume_is_refused(kind: Any, rul
 
 
 @pytest.mark.parametrize("frozen", [False, True])
-@pytest.mark.parametrize("kind", [Speed, Unusual])
+@pytest.mark.parametrize("kind", [Speed, Unusual, Dropout])
 def test_the_check_of_a_reward_changes_no_result(kind: Any, frozen: bool) -> None:
     shown: Any = {"trajectories": torch.randn(2 * kind.trajectories, 4, 6)}
     checked, plain = own(kind, frozen=frozen), RewardLearner(kind(SIZES), 1e-3, frozen=frozen)
