@@ -132,7 +132,7 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
 
     def make_module(self) -> None:
         spec = self.config.get_rl_module_spec(spaces=self.get_spaces(), inference_only=True)
-        self.module: TACModule = spec.build()
+        self.module: TACModule = spec.build().eval()
 
     def get_spaces(self) -> dict[str, Any]:
         if not self.envs:

@@ -41,16 +41,15 @@ class OfflineCallbacks(RLlibCallback):  # type: ignore[misc]
 class OwnNetworks(TACModule):
     """A policy and a value network with other layers, of a given width.
 
-    The value network has dropout, which draws from PyTorch's own generator.
+    Both have dropout, which draws from PyTorch's own generator.
     """
 
     def setup(self) -> None:
         super().setup()
         width = self.model_config["width"]
         for name, outputs in (("policy", 2 * self.action_size), ("value", 1)):
-            layers = nn.Linear(self.input_size, width), nn.Tanh(), nn.Linear(width, outputs)
-            setattr(self, name, nn.Sequential(*layers))
-        self.value.insert(1, nn.Dropout(0.1))
+            first, last = nn.Linear(self.input_size, width), nn.Linear(width, outputs)
+            setattr(self, name, nn.Sequential(first, nn.Dropout(0.1), nn.Tanh(), last))
         self.make_target_networks()
 
 
@@ -358,7 +357,9 @@ def test_own_networks_act_learn_and_are_restored(tmp_path: Path) -> None:
     inputs = np.ones((2, 13), np.float32)
     acted = algo.env_runner.module.actor()(inputs, None)
     module = algo.learner_group._learner.module["default_policy"]
-    np.testing.assert_array_equal(acted, module.act(torch.from_numpy(inputs)).numpy())
+    assert module.training, "dropout is for updates only"
+    np.testing.assert_array_equal(acted, module.eval().act(torch.from_numpy(inputs)).numpy())
+    module.train()
     algo.save_to_path(tmp_path / "checkpoint")
     expected = fingerprint(algo, 1)
     resumed.restore_from_path(tmp_path / "checkpoint")
