@@ -43,6 +43,9 @@ def answer(sweep: Sweep, study: Study) -> list[str]:
             why = "trials are not compared on the seeds that select them"
             return [*sentences, f"No run on fresh seeds has finished: {why}."]
         return [*sentences, "No run that may be compared has finished yet."]
+    if not any(mean.scores.finished for mean in study.means):
+        failed = sum(mean.scores.failed for mean in study.means)
+        return [*sentences, f"No run has a result: {failed} failed."]
     shown = [claim for claim in study.claims if claim.task == ALL_TASKS] or list(study.claims)
     sentences += [f"{claim_in_words(claim)}." for claim in shown[:MOST_CLAIMS]]
     if not shown and study.unplanned:

@@ -459,7 +459,7 @@ SWEEPS: dict[str, Callable[[], tuple[Sweep, Sequence[str]]]] = {
         sweep_of(
             [(one_run("1", 0), Points([names.EVAL_SUCCESS] * 2, [1, 2], [1, 2], [0.5, np.nan]))]
         ),
-        ["Only one condition has a result", "1 failed run counts with the worst value"],
+        ["No run has a result: 1 failed."],
     ),
 }
 
