@@ -115,8 +115,10 @@ class ColoredNoise(StrictModel):
     """Share of actions that are random instead (`tac.random_actions`)."""
 
 
-def _alpha_kind(value: object) -> str:
+def _alpha_kind(value: object) -> str | None:
     """Tag of the member of `Alpha` that `value` should be, by the key that only it has."""
+    if isinstance(value, str):  # such as "auto", which other libraries have
+        return None
     kinds = {"learned": LearnedAlpha, "matched_width": MatchedAlpha, "normalised": NormalisedAlpha}
     for key, kind in kinds.items():
         if (isinstance(value, dict) and key in value) or isinstance(value, kind):
@@ -129,7 +131,11 @@ Alpha = Annotated[
     | Annotated[LearnedAlpha, Tag("LearnedAlpha")]
     | Annotated[MatchedAlpha, Tag("MatchedAlpha")]
     | Annotated[NormalisedAlpha, Tag("NormalisedAlpha")],
-    Discriminator(_alpha_kind),
+    Discriminator(
+        _alpha_kind,
+        custom_error_type="alpha",
+        custom_error_message="must be a number, a schedule, or {learned: true}",
+    ),
 ]
 """Entropy coefficient: a constant or a schedule, unchanged or scaled for each q, or learned."""
 

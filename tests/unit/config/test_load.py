@@ -341,6 +341,10 @@ BAD: list[tuple[Document, str]] = [
         "stages.pretrain.tac.entropic_index.end must be given",
     ),
     (
+        with_stage(0, tac={"alpha": "auto"}),
+        'alpha must be a number, a schedule, or {learned: true}, got "auto"',
+    ),
+    (
         with_stage(0, tac={"alpha": {"learned": True, "initial": -1.0}}),
         "stages.pretrain.tac.alpha.initial must be > 0, got -1.0",
     ),
