@@ -39,6 +39,7 @@ from music_rllib.envs.values import (
     GOAL_KEYS,
     BadNumberError,
     check_action_space,
+    check_torch_type,
     flag_of,
     observation_sizes,
     shown,
@@ -157,6 +158,10 @@ class Probe:
         self._play(env, smallest, actions=1, steps=REPEATED_STEPS)
         self._repeat(env, first, largest)
         self._play_more(env)
+        try:
+            check_torch_type()
+        except ValueError as error:
+            self.problems.append(str(error))
         self._add_remarks()
 
     # -- calls of the environment ---------------------------------------------------------

@@ -6,6 +6,7 @@ text. All functions raise ValueError; callers add the environment and the step.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from typing import Any
 
@@ -33,6 +34,19 @@ class BadNumberError(RuntimeError):
             f"{place}: {problem}\n"
             "The run stops before anything is learned from it; its last checkpoint is good."
         )
+
+
+def check_torch_type() -> None:
+    """Raise ValueError if an environment or its module changed PyTorch's default type; undo it."""
+    torch = sys.modules.get("torch")
+    if torch is None or (found := torch.get_default_dtype()) is torch.float32:
+        return
+    torch.set_default_dtype(torch.float32)
+    raise ValueError(
+        "PyTorch's default type must stay float32, as the networks have it, got "
+        f"{str(found).removeprefix('torch.')}: an environment or its module calls "
+        "torch.set_default_dtype"
+    )
 
 
 # -- spaces -----------------------------------------------------------------------------------

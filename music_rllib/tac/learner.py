@@ -25,7 +25,7 @@ from torch import Tensor
 
 from music_rllib import names
 from music_rllib.config.tac_settings import LearnedAlpha, TACSettings
-from music_rllib.envs.values import observation_sizes
+from music_rllib.envs.values import check_torch_type, observation_sizes
 from music_rllib.intrinsic.interface import Sizes
 from music_rllib.intrinsic.music import Music
 from music_rllib.intrinsic.relabeling import RewardLearner, make_reward
@@ -57,6 +57,7 @@ class TACLearner(TorchLearner):
     def build(self) -> None:
         quiet_third_parties()  # a remote Learner is a process of its own
         keep_freed_memory()
+        check_torch_type()
         self._settings: TACSettings = self.config.settings.tac
         # Otherwise an algorithm in the driver uses every core for 256-row products, runs twenty
         # times slower beside another trial, and gets other sums.

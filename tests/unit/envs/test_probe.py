@@ -6,6 +6,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from gymnasium import spaces
 
 from music_rllib.envs import probe
@@ -102,6 +103,11 @@ class OldReset(Sound):
         return super().reset(**arguments)[0]
 
 
+class Double(Sound):
+    def __init__(self) -> None:
+        torch.set_default_dtype(torch.float64)
+
+
 class OneNumber(Sound):
     def seen(self) -> Any:
         return super().seen() | {"achieved_goal": np.float32(1)}
@@ -121,6 +127,7 @@ class OneNumber(Sound):
         (changed(stops), "step() must not raise, it raised SystemExit: 3 ("),
         (OldReset, "reset() must return (observation, info) with a dictionary info"),
         (OneNumber, "achieved_goal must have shape (2,), as its space declares"),
+        (Double, "PyTorch's default type must stay float32, as the networks have it, got float64"),
         (SmallSeeds, "reset(seed=0) must not raise, it raised IndexError: level 0 is not there"),
     ],
 )
