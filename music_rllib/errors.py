@@ -1,12 +1,15 @@
 """Errors that a user sees, and the exit codes of every command."""
 
+import re
+
 FAILED, BAD_INPUT = 1, 2
+_COLORS = re.compile(r"\x1b\[[0-9;]*m")
 
 
 def message_of(error: BaseException) -> str:
-    """An error's message; an environment's error class can fail to give it."""
+    """An error's message without colors; an environment's error class can fail to give it."""
     try:
-        return str(error)
+        return _COLORS.sub("", str(error))
     except Exception as own:
         return f"(its message can't be read: {type(own).__name__})"
 

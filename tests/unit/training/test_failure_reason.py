@@ -54,6 +54,7 @@ def test_an_exception_without_a_readable_message_keeps_its_name() -> None:
         == "WordlessError: (its message can't be read: LookupError)"
     )
     assert cause_of(SystemExit(3), "") == "SystemExit: 3"
+    assert cause_of(ValueError("\x1b[1m\x1b[31mred\x1b[0m"), "") == "ValueError: red"
     with pytest.raises(BadInputError, match=r"^WordlessError: "), in_words_only():
         raise WordlessError(1, 2)
 
