@@ -17,6 +17,7 @@ from torch import Tensor
 
 from music_rllib import names
 from music_rllib.envs.tasks import make_importable
+from music_rllib.errors import one_line
 from music_rllib.intrinsic.interface import Batch, IntrinsicReward, Sizes, check_result
 from music_rllib.intrinsic.settings import BUILT_IN, IntrinsicSettings
 from music_rllib.kernels.adam import FusedAdam
@@ -263,17 +264,22 @@ def _check_on(batch: Batch, make: Callable[[], RewardLearner]) -> None:
 
     with torch.random.fork_rng(devices=[]):
         first, resumed = make(), make()
+        kind = type(first.reward).__name__
         learned(first)
-        resumed.load_state(first.state())
+        try:
+            resumed.load_state(first.state())
+        except RuntimeError as error:
+            rule = f"{kind} must keep the shapes of its parameters and buffers"
+            raise ValueError(f"{rule}, a checkpoint raised {one_line(error)}") from error
         # Layers such as dropout draw from PyTorch's own generator, which checkpoints keep.
         begin = torch.get_rng_state()
         rewards = learned(first)
         torch.set_rng_state(begin)
         if not torch.equal(rewards, learned(resumed)):
             raise ValueError(
-                f"{type(first.reward).__name__} must keep everything that changes in parameters "
-                "and buffers, and take random numbers from batch.generator: its rewards differ "
-                "after a checkpoint is loaded"
+                f"{kind} must keep everything that changes in parameters and buffers, and take "
+                "random numbers from batch.generator: its rewards differ after a checkpoint is "
+                "loaded"
             )
 
 

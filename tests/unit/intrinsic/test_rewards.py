@@ -286,6 +286,21 @@ class Counting(Speed):
         return super().bonus(batch) / self.seen
 
 
+class Growing(Speed):
+    """Distance to the nearest state of a memory that grows."""
+
+    memory: Tensor
+
+    def __init__(self, sizes: Sizes) -> None:
+        super().__init__(sizes)
+        self.register_buffer("memory", torch.zeros(1, sizes.observation))
+
+    def bonus(self, batch: Batch) -> Tensor:
+        distances = torch.cdist(batch.followers, self.memory)
+        self.memory = torch.cat([self.memory, batch.followers])
+        return distances.amin(-1)
+
+
 class NumpyNoise(Speed):
     def bonus(self, batch: Batch) -> Tensor:
         return torch.from_numpy(np.random.default_rng().random(len(batch.states)))
@@ -338,6 +353,7 @@ def own(kind: type[IntrinsicReward], *, frozen: bool = False) -> RewardLearner:
         (InPlace, "must not change the followers of its batch in place"),
         (InPlaceLoss, "must not change the actions of its batch in place"),
         (Counting, "keep everything that changes in parameters and buffers"),
+        (Growing, "must keep the shapes .* size mismatch for memory"),
         (NumpyNoise, r"take random numbers from batch\.generator"),
         (Drawn, "keep everything"),
         (OwnOptimizer, "keep everything"),
