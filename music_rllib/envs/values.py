@@ -43,7 +43,7 @@ def check_torch_type() -> None:
         return
     torch.set_default_dtype(torch.float32)
     raise ValueError(
-        "PyTorch's default type must stay float32, as the networks have it, got "
+        "PyTorch's default type must stay float32, the type of the networks, got "
         f"{str(found).removeprefix('torch.')}: an environment or its module calls "
         "torch.set_default_dtype"
     )

@@ -127,7 +127,7 @@ class OneNumber(Sound):
         (changed(stops), "step() must not raise, it raised SystemExit: 3 ("),
         (OldReset, "reset() must return (observation, info) with a dictionary info"),
         (OneNumber, "achieved_goal must have shape (2,), as its space declares"),
-        (Double, "PyTorch's default type must stay float32, as the networks have it, got float64"),
+        (Double, "PyTorch's default type must stay float32, the type of the networks, got float64"),
         (SmallSeeds, "reset(seed=0) must not raise, it raised IndexError: level 0 is not there"),
     ],
 )
