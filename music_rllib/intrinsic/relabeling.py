@@ -1,12 +1,10 @@
-"""Trains an intrinsic reward's networks beside the policy, and makes it from its name.
+"""Trains an intrinsic reward's networks beside the policy, and checks a user's class.
 
 Shape legend: K updates of a call, B transitions of one.
 """
 
 from __future__ import annotations
 
-import importlib
-import inspect
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, cast
 
@@ -16,67 +14,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from music_rllib import names
-from music_rllib.envs.tasks import make_importable
 from music_rllib.errors import one_line
-from music_rllib.intrinsic.interface import Batch, IntrinsicReward, Sizes, check_result
-from music_rllib.intrinsic.settings import BUILT_IN, IntrinsicSettings
+from music_rllib.intrinsic.interface import Batch, IntrinsicReward, check_result
 from music_rllib.kernels.adam import FusedAdam
 from music_rllib.replay.trajectories import Floats, Trajectory
-
-
-def reward_class(name: str) -> type[IntrinsicReward]:
-    """The class of a built-in reward, or of a user's `module:Class`, whose module is imported.
-
-    Raises:
-        ValueError: The module cannot be imported, or has no such class.
-    """
-    module, _, attribute = BUILT_IN.get(name, name).partition(":")
-    try:
-        if name not in BUILT_IN:
-            make_importable(module)
-        found = getattr(importlib.import_module(module), attribute, None)
-    except ImportError as error:
-        raise ValueError(f"intrinsic.reward must be importable, got {name!r}: {error}") from error
-    if not (isinstance(found, type) and issubclass(found, IntrinsicReward)):
-        raise ValueError(
-            f"intrinsic.reward must name a subclass of IntrinsicReward in {module}, got {name!r}"
-        )
-    if inspect.isabstract(found):
-        raise ValueError(f"intrinsic.reward must have a method bonus, which {name} lacks")
-    return found
-
-
-def checked_class(settings: IntrinsicSettings) -> type[IntrinsicReward]:
-    """The class of a reward whose settings fit its constructor.
-
-    Raises:
-        ValueError: As `reward_class`, or the settings do not fit.
-    """
-    assert settings.reward is not None
-    kind = reward_class(settings.reward)
-    try:
-        inspect.signature(kind).bind(None, **settings.settings)
-    except TypeError as error:
-        raise ValueError(f"intrinsic.settings must fit {settings.reward}: {error}") from error
-    return kind
-
-
-def make_reward(
-    settings: IntrinsicSettings, sizes: Sizes, seed: int, device: torch.device | None = None
-) -> IntrinsicReward:
-    """A reward on a device, with initial weights that depend on the seed only.
-
-    Raises:
-        ValueError: The class, its settings or the environment do not fit.
-    """
-    kind = checked_class(settings)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        reward = kind(sizes, **settings.settings)
-    if getattr(reward, "sums", None) is None:
-        raise ValueError(f"{settings.reward} must call super().__init__(sizes) in its __init__")
-    return reward.to(device)
-
 
 PERIOD = 4
 """Updates of the policy for each step of a reward's networks: it learns from a quarter of the
@@ -149,7 +90,7 @@ class RewardLearner:
             ValueError: A method of the class returned or did something that it must not.
         """
         if self._again is not None and not self._updates:
-            _check_on(_part(batch, 0, updates), self._again)
+            _check_own_class(_part(batch, 0, updates), self._again)
         rewards, bonuses, losses = [], [], []
         for k in range(updates):
             part = _part(batch, k, updates)
@@ -239,7 +180,7 @@ class RewardLearner:
             self._adam.load_state_dict({"state": moments, "param_groups": groups})
 
 
-def _check_on(batch: Batch, make: Callable[[], RewardLearner]) -> None:
+def _check_own_class(batch: Batch, make: Callable[[], RewardLearner]) -> None:
     """Check that a user's reward leaves a minibatch as it is, and resumes exactly.
 
     Otherwise the critics would learn from changed data, and a resumed run would differ, both
@@ -258,7 +199,6 @@ def _check_on(batch: Batch, make: Callable[[], RewardLearner]) -> None:
         rewards = torch.cat([learner.learn(own, 1)[0] for _ in range(PERIOD)])
         for name, each in given.items():
             if not torch.equal(each, copies[name]):
-                kind = type(learner.reward).__name__
                 raise ValueError(f"{kind} must not change the {name} of its batch in place")
         return rewards
 

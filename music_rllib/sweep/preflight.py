@@ -99,7 +99,7 @@ def fingerprints(plan: Plan) -> dict[str, Fingerprint]:
         run.intrinsic.identity: run.intrinsic for run in plan.settings if run.own_modules
     }
     for settings in own_rewards.values():
-        from music_rllib.intrinsic.relabeling import checked_class
+        from music_rllib.intrinsic.make import checked_class
 
         try:
             checked_class(settings)

@@ -33,7 +33,7 @@ from music_rllib.envs.make import (
     moved_distance_of,
 )
 from music_rllib.envs.values import BadNumberError
-from music_rllib.intrinsic.relabeling import reward_class
+from music_rllib.intrinsic.make import reward_class
 from music_rllib.replay.buffer import TrajectoryReplay
 from music_rllib.replay.trajectories import Floats, WholeTrajectories
 from music_rllib.runtime.machine import own_folder

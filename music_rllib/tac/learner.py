@@ -27,8 +27,9 @@ from music_rllib import names
 from music_rllib.config.tac_settings import LearnedAlpha, TACSettings
 from music_rllib.envs.values import check_torch_type, observation_sizes
 from music_rllib.intrinsic.interface import Sizes
+from music_rllib.intrinsic.make import make_reward
 from music_rllib.intrinsic.music import Music
-from music_rllib.intrinsic.relabeling import RewardLearner, make_reward
+from music_rllib.intrinsic.relabeling import RewardLearner
 from music_rllib.replay.trajectories import Trajectory
 from music_rllib.runtime.process import keep_freed_memory, use_reproducible_gpu_kernels
 from music_rllib.runtime.quiet import quiet_third_parties

@@ -13,8 +13,9 @@ import torch
 from torch import Tensor
 
 from music_rllib.intrinsic.interface import Batch, IntrinsicReward, Sizes
+from music_rllib.intrinsic.make import make_reward
 from music_rllib.intrinsic.novelty import E3B
-from music_rllib.intrinsic.relabeling import RewardLearner, make_reward
+from music_rllib.intrinsic.relabeling import RewardLearner
 from music_rllib.intrinsic.settings import BUILT_IN, SETTINGS, IntrinsicSettings
 from music_rllib.replay.trajectories import Trajectory
 from music_rllib.store.serialization import read_state, write_state
