@@ -23,7 +23,7 @@ from music_rllib.envs.values import (
     success_of,
     vector,
 )
-from music_rllib.replay.buffer import GoalReward
+from music_rllib.replay.buffer import GoalEnd, GoalReward
 from music_rllib.replay.trajectories import ReplayLayout, Trajectory
 
 Floats = NDArray[np.float32]
@@ -61,6 +61,7 @@ class Recording:
         success: key of `info` that reports success, and the value of a step without it.
         goal_reward: the function that hindsight uses; the rewards of the episode must equal its
             values. None without hindsight.
+        goal_end: the function that hindsight uses; the episode must terminate where it is True.
     """
 
     def __init__(
@@ -71,9 +72,10 @@ class Recording:
         zero_goal: bool = False,
         success: tuple[str | None, bool | None] = (None, None),
         goal_reward: GoalReward | None = None,
+        goal_end: GoalEnd | None = None,
     ) -> None:
         self._layout, self._zero_goal, self._name = layout, zero_goal, name
-        self._success, self._goal_reward = success, goal_reward
+        self._success, self._goal_reward, self._goal_end = success, goal_reward, goal_end
         self._frames = np.zeros((layout.horizon + 1, layout.frame), np.float32)
         self._actions = np.zeros((layout.horizon, layout.action), np.float32)
         self._rewards = np.zeros(layout.horizon, np.float32)
@@ -136,7 +138,7 @@ class Recording:
                     check_numbers(name, given[name])
 
     def finish(self, *, terminated: bool) -> Episode:
-        """The finished episode; raises BadNumberError if hindsight computes other rewards."""
+        """The finished episode; raises BadNumberError if hindsight computes other steps."""
         n = self.steps
         episode = Episode(
             self._frames[: n + 1],
@@ -146,15 +148,37 @@ class Recording:
             np.array(self._successes) if self._successes else None,
         )
         if self._goal_reward is not None and not self._zero_goal:
-            goals = episode.frames[:, self._layout.observation :]
-            if found := first_mismatch(self._goal_reward, goals, episode.rewards):
-                step, given, computed = found
-                raise BadNumberError.at(
-                    f"{self._name}, step {step}",
-                    "replay.hindsight_k must be 0 if compute_reward is not the whole reward of "
-                    f"a step: a step returned reward {given:g}, compute_reward gives {computed:g}",
-                )
+            self._check_hindsight(self._goal_reward, episode)
         return episode
+
+    def _check_hindsight(self, reward: GoalReward, episode: Episode) -> None:
+        goals = episode.frames[:, self._layout.observation :]
+        if found := first_mismatch(reward, goals, episode.rewards):
+            step, given, computed = found
+            problem = (
+                "compute_reward is not the whole reward of a step: a step returned reward "
+                f"{given:g}, compute_reward gives {computed:g}"
+            )
+        elif ended := self._end_not_played(goals, episode.terminated):
+            step, problem = ended, "episodes continue where compute_terminated is True"
+        else:
+            return
+        rule = f"replay.hindsight_k must be 0 if {problem}"
+        raise BadNumberError.at(f"{self._name}, step {step}", rule)
+
+    def _end_not_played(self, goals: NDArray[np.float32], terminated: bool) -> int | None:
+        """The first step whose goals end an episode that did not terminate there."""
+        if self._goal_end is None:
+            return None
+        desired, achieved = np.split(goals[1:], 2, axis=1)
+        computed = self._goal_end(achieved, desired)
+        if not computed.any():
+            return None
+        ends = np.zeros(len(computed), np.float32)
+        # An episode may terminate for another reason than its goal.
+        ends[-1] = terminated and computed[-1]
+        found = first_mismatch(self._goal_end, goals, ends)
+        return None if found is None else found[0]
 
 
 # -- rewards of goals -------------------------------------------------------------------------

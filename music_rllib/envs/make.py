@@ -27,14 +27,16 @@ from music_rllib.envs.values import (
     are_usable,
     check_action_space,
     check_numbers,
+    flag_of,
     observation_sizes,
     to_bounds,
 )
 from music_rllib.errors import first_line, one_line
-from music_rllib.replay.buffer import GoalReward
+from music_rllib.replay.buffer import GoalEnd, GoalReward
 from music_rllib.replay.trajectories import ReplayLayout, Transitions
 
 Env = gym.Env[Any, Any]
+Floats = NDArray[np.float32]
 
 
 def make_env(env_id: str, **kwargs: Any) -> Env:
@@ -209,6 +211,8 @@ def goal_reward_of(env: Env, seed: int = 0) -> GoalReward:
 
 _BY_ROW = "compute_reward does not compute each row of a batch independently"
 _KEPT = "goals lose digits in float32 on which rewards depend"
+_ROWS = 256
+"""Number of goals whose rewards are compared before training."""
 _TRIED_STEPS = 20
 """Maximum number of random steps whose rewards are compared before training."""
 
@@ -219,23 +223,77 @@ def _problem_of(reward: GoalReward, env: Env, seed: int) -> tuple[str, str] | No
     Raises:
         BadNumberError: A step has another reward than its goals.
     """
-    first, rows = env.reset(seed=seed)[0], 256
-    start = np.asarray(first["achieved_goal"])
-    distance = float(np.linalg.norm(start - first["desired_goal"])) or 1.0
-    achieved = np.tile(start.astype(np.float32), (rows, 1))
-    # From within any threshold to far beyond it.
-    longest = max(1.0, distance)
-    offsets = longest * random_offsets(rows, len(start), 1e-3 / longest, 1.0)
-    desired = (achieved + offsets).astype(np.float32)
+    first = env.reset(seed=seed)[0]
+    start, distance, achieved, desired = _goals_near(first)
     together = reward(achieved, desired)
     played = _play_some(reward, env, first)  # a reward may depend on the simulator's state
-    alone = [reward(achieved[i : i + 1], desired[i : i + 1]) for i in range(rows)]
-    apart = np.abs(together - np.concatenate(alone)) if together.shape == (rows,) else np.ones(1)
+    alone = [reward(achieved[i : i + 1], desired[i : i + 1]) for i in range(_ROWS)]
+    apart = np.abs(together - np.concatenate(alone)) if together.shape == (_ROWS,) else np.ones(1)
     if not apart.max() <= 1e-5 * np.abs(together).max():
         return _BY_ROW, "rewards change with the batch or the simulator"
     played.finish(terminated=False)
     lost = lost_by_rounding(reward, start, distance)
     return (_KEPT, lost) if lost else None
+
+
+def _goals_near(first: Any) -> tuple[NDArray[Any], float, Floats, Floats]:
+    """The achieved goal of a first observation, its distance to the desired one, goals [256, G].
+
+    The achieved goals are all that of `first`; the desired ones lie from within any threshold to
+    far beyond it.
+    """
+    start = np.asarray(first["achieved_goal"])
+    distance = float(np.linalg.norm(start - first["desired_goal"])) or 1.0
+    achieved = np.tile(start.astype(np.float32), (_ROWS, 1))
+    longest = max(1.0, distance)
+    offsets = longest * random_offsets(_ROWS, len(start), 1e-3 / longest, 1.0)
+    return start, distance, achieved, (achieved + offsets).astype(np.float32)
+
+
+def compute_terminated_of(env: Env) -> GoalEnd | None:
+    """The environment's `compute_terminated`, called for one row after another; None without it."""
+    compute = getattr(env.unwrapped, "compute_terminated", None)
+    if compute is None or not isinstance(env.observation_space, spaces.Dict):
+        return None
+
+    def ends(achieved: Floats, desired: Floats) -> NDArray[np.bool_]:
+        pairs = zip(np.array(achieved), np.array(desired), strict=True)
+        flags = [flag_of(compute(*pair, {}), "compute_terminated") for pair in pairs]
+        return np.array(flags, np.bool_)
+
+    return ends
+
+
+def goal_end_of(env: Env, seed: int = 0) -> GoalEnd | None:
+    """Where the environment ends an episode because of its goals; None if it never does.
+
+    Resets `env` with `seed`.
+
+    Raises:
+        ValueError: `compute_terminated` does not compute a flag from two goals.
+    """
+    by_row = compute_terminated_of(env)
+    if by_row is None:
+        return None
+    _, _, achieved, desired = _goals_near(env.reset(seed=seed)[0])
+    try:
+        expected = by_row(achieved, desired)
+    except Exception as error:
+        raise ValueError(
+            "replay.hindsight_k must be 0 if compute_terminated does not compute a flag from two "
+            f"goals: with {name_of(env)}, it raises {one_line(error)}"
+        ) from error
+    if not expected.any():
+        return None
+    compute: Any = env.unwrapped.compute_terminated  # type: ignore[attr-defined]
+
+    def together(achieved: Floats, desired: Floats) -> NDArray[np.bool_]:
+        return np.asarray(compute(np.array(achieved), np.array(desired), {}), np.bool_)
+
+    with contextlib.suppress(Exception):  # it may take single goals only, and is slower then
+        if np.array_equal(together(achieved, desired), expected):
+            return together
+    return by_row
 
 
 def _play_some(reward: GoalReward, env: Env, first: Any) -> Recording:

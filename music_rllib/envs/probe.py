@@ -29,6 +29,7 @@ from music_rllib.envs.features import beyond_observation
 from music_rllib.envs.make import (
     Env,
     augmentation_of,
+    goal_end_of,
     goal_reward_of,
     make_env,
     moved_distance_of,
@@ -46,7 +47,7 @@ from music_rllib.envs.values import (
     to_bounds,
 )
 from music_rllib.errors import first_line, one_line
-from music_rllib.replay.buffer import GoalReward
+from music_rllib.replay.buffer import GoalEnd, GoalReward
 from music_rllib.replay.trajectories import ReplayLayout
 
 REQUEST, ANSWERS = "request", "answers"
@@ -98,6 +99,8 @@ class Probe:
         self._unused: set[str] = set()
         self._types: set[str] = set()
         self._reward: GoalReward | None = None
+        self._end: GoalEnd | None = None
+        self._terminates = False
 
     def run(self) -> None:
         """Make the environment, play it and close it."""
@@ -153,7 +156,7 @@ class Probe:
         self._try_seeds(env, smallest, largest)
         first = self._play(env, largest, actions=0)
         if self._hindsight and goal:
-            self._reward = self._goal_reward(env, smallest)
+            self._check_goals(env, smallest)
         self._check_symmetries(env, smallest)
         self._play(env, smallest, actions=1, steps=REPEATED_STEPS)
         self._repeat(env, first, largest)
@@ -219,18 +222,20 @@ class Probe:
             raise
         return _check_step(result)
 
-    def _goal_reward(self, env: Env, seed: int) -> GoalReward | None:
-        self._watch("compute_reward()")
+    def _check_goals(self, env: Env, seed: int) -> None:
+        self._watch(call := "compute_reward()")
         try:
             reward = goal_reward_of(env, seed)
             if "moved" in self._hindsight and self._task.moved_distance is None:
                 moved_distance_of(env, reward, seed)
+            self._watch(call := "compute_terminated()")
+            self._end = goal_end_of(env, seed)
         except ValueError as error:
             self.problems.append(first_line(error))
-            return None
         except BaseException as error:
-            raise RefusedError(f"compute_reward() raised {one_line(error)}") from error
-        return reward
+            raise RefusedError(f"{call} raised {one_line(error)}") from error
+        else:
+            self._reward = reward
 
     def _check_symmetries(self, env: Env, seed: int) -> None:
         symmetries = self._task.symmetries
@@ -252,10 +257,12 @@ class Probe:
             name=f"after reset(seed={seed})",
             success=(self._task.success_key, False),
             goal_reward=self._reward,
+            goal_end=self._end,
         )
         rng, end = np.random.default_rng(actions), time.monotonic() + EPISODE_SECONDS
         space = check_action_space(env.action_space)
-        ended, last = False, min(steps or self._layout.horizon, self._layout.horizon)
+        ended = terminated = False
+        last = min(steps or self._layout.horizon, self._layout.horizon)
         try:
             recording.see(observation)
             self._compare_types(env.observation_space, observation)
@@ -267,7 +274,8 @@ class Probe:
                 recording.step(action[0], reward, info, observation)
                 ended = terminated or truncated
             self._steps += recording.steps
-            episode = recording.finish(terminated=ended)
+            self._terminates |= terminated
+            episode = recording.finish(terminated=terminated)
         except BadNumberError as error:
             raise RefusedError(first_line(error)) from None
         self._rewards.update(episode.rewards.tolist())
@@ -328,6 +336,12 @@ class Probe:
                     f"success_key {key!r} was not in info in {self._steps} random steps (keys: "
                     f"{known}){closest(key, self._keys)}; a step without it counts as not reached"
                 )
+        if self._terminates and self._reward is not None and self._end is None:
+            self.remarks.append(
+                "step() terminates episodes; if it does so at the goal, hindsight needs "
+                "compute_terminated(achieved_goal, desired_goal, info), or relabeled transitions "
+                "do not end at their new goal"
+            )
         self.remarks += (f"{line}; the networks get float32" for line in sorted(self._types))
         if unused := self._unused - {*GOAL_KEYS}:
             self.remarks.append(

@@ -35,6 +35,8 @@ from music_rllib.replay.trajectories import (
 
 GoalReward = Callable[[Floats, Floats], NDArray[Any]]
 """(achieved [B, G], desired [B, G]) -> [B] rewards, without touching a simulator."""
+GoalEnd = Callable[[Floats, Floats], NDArray[np.bool_]]
+"""(achieved [B, G], desired [B, G]) -> [B] whether a step to these goals ends the episode."""
 
 
 class TrajectoryReplay(TrajectoryRing):
@@ -45,6 +47,8 @@ class TrajectoryReplay(TrajectoryRing):
         capacity: largest number of transitions of full episodes, rounded down to whole episodes.
         rng: source of all random numbers of sampling.
         goal_reward: recomputes rewards of relabeled transitions; needed for hindsight.
+        goal_end: recomputes where relabeled transitions end. None: the environment does not end
+            episodes at a goal, and they end where the played episode does.
         hindsight_k: HER (Andrychowicz et al. 2017): a share k/(1+k) of transitions gets a goal
             that their trajectory achieved.
         hindsight_goals: achieved `future`: later; `final`: at its end; `episode`: after any step.
@@ -72,6 +76,7 @@ class TrajectoryReplay(TrajectoryRing):
         rng: np.random.Generator,
         *,
         goal_reward: GoalReward | None = None,
+        goal_end: GoalEnd | None = None,
         hindsight_k: float = 0.0,
         hindsight_goals: Literal["future", "final", "episode"] = "future",
         n_steps: int = 1,
@@ -87,7 +92,7 @@ class TrajectoryReplay(TrajectoryRing):
                 f"replay.hindsight_k must be 0 without a goal environment, got {hindsight_k:g}"
             )
         self.rng = rng
-        self._goal_reward = goal_reward
+        self._goal_reward, self._goal_end = goal_reward, goal_end
         self._hindsight_share = hindsight_k / (1.0 + hindsight_k)
         self._goals, self._n_steps, self._gamma = hindsight_goals, n_steps, gamma
         self._augment = augment
@@ -186,19 +191,19 @@ class TrajectoryReplay(TrajectoryRing):
         both = self._read(row, 0, after + frame)
         inputs, next_inputs = both[:, :width].copy(), both[:, after : after + width].copy()
         actions, rewards = both[:, frame : after - 2].copy(), both[:, after - 2].copy()
+        discounts = 1.0 - both[:, after - 1]
         if relabelled:
             goals = self._achieved(start[chosen], step[chosen], length[chosen])
             inputs[chosen, self.layout.observation :] = goals
             next_inputs[chosen, self.layout.observation :] = goals
-            assert self._goal_reward is not None
-            rewards[chosen] = self._goal_reward(both[chosen, after + width :], goals)
-        discounts = 1.0 - both[:, after - 1]
+            rewards[chosen], discounts[chosen] = self._relabelled(both, chosen, goals)
         weights = None
         if self._td is not None:
             weights = self._td.importance_weights(row, len(self), importance_exponent)
         drawn = Transitions(inputs, actions, rewards, discounts, next_inputs, weights, row)
         for i in range(1, self._n_steps):
-            self._add_step(drawn, i, np.flatnonzero(step + i < length), chosen)
+            continues = (step + i < length) & (drawn.discounts > 0)
+            self._add_step(drawn, i, np.flatnonzero(continues), chosen)
         if self._augment is not None:
             self._augment(self.rng, drawn)
         return drawn
@@ -215,19 +220,32 @@ class TrajectoryReplay(TrajectoryRing):
                 later = 1 + (self.rng.random(len(start)) * length).astype(np.int64)
         return self._read(start + later, self.layout.network_input, self.layout.goal)
 
+    def _relabelled(self, both: Floats, rows: Any, goals: Floats) -> tuple[NDArray[Any], Floats]:
+        """Rewards and discounts [B] of the stored steps `both[rows]` with new goals [B, G].
+
+        A step that ended the episode for another reason than its goal ends it with any goal.
+        """
+        assert self._goal_reward is not None
+        last, goal = self._steps.shape[1] - 1, self.layout.goal
+        achieved, ended = both[rows, -goal:], both[rows, last] > 0
+        if self._goal_end is not None:
+            if ended.any():
+                own = both[rows, -2 * goal : -goal]
+                ended[ended] = ~self._goal_end(achieved[ended], own[ended])
+            ended |= self._goal_end(achieved, goals)
+        return self._goal_reward(achieved, goals), 1.0 - ended.astype(np.float32)
+
     def _add_step(self, drawn: Transitions, ahead: int, rows: Rows, relabelled: Rows) -> None:
         """Extend the transitions `rows` by the step that is `ahead` of their first one."""
-        observation, width = self.layout.observation, self.layout.network_input
-        after = self._steps.shape[1]
+        observation, after = self.layout.observation, self._steps.shape[1]
         both = self._read(drawn.rows[rows] + ahead, 0, after + self.layout.frame)
-        rewards = both[:, after - 2].copy()
+        rewards, discounts = both[:, after - 2].copy(), 1.0 - both[:, after - 1]
         new = np.isin(rows, relabelled)
         if new.any():
-            assert self._goal_reward is not None
             goals = drawn.inputs[rows[new], observation:]
-            rewards[new] = self._goal_reward(both[new, after + width :], goals)
+            rewards[new], discounts[new] = self._relabelled(both, new, goals)
         drawn.rewards[rows] += self._gamma**ahead * rewards
-        drawn.discounts[rows] = self._gamma**ahead * (1.0 - both[:, after - 1])
+        drawn.discounts[rows] = self._gamma**ahead * discounts
         drawn.next_inputs[rows, :observation] = both[:, after : after + observation]
 
     def update_priorities(self, rows: Rows, errors: Floats) -> None:

@@ -29,6 +29,7 @@ from ray.rllib.utils.typing import StateDict
 from music_rllib.envs.episodes import Episode
 from music_rllib.envs.make import (
     augmentation_of,
+    goal_end_of,
     goal_reward_of,
     moved_distance_of,
 )
@@ -96,6 +97,7 @@ class TAC(Algorithm):
             settings.capacity,
             np.random.default_rng((seed_or_entropy(self.config.seed), _REPLAY_STREAM)),
             goal_reward=goal_reward,
+            goal_end=goal_end_of(runner.env, seed) if goal_reward else None,
             hindsight_k=settings.hindsight_k,
             hindsight_goals=settings.hindsight_goals,
             n_steps=settings.n_steps,

@@ -37,6 +37,7 @@ from music_rllib.envs.features import beyond_observation
 from music_rllib.envs.make import (
     Env,
     compute_reward_of,
+    compute_terminated_of,
     episode_limit,
     in_environment,
     is_gymnasium_id,
@@ -223,6 +224,7 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
             name=name,
             success=self._success,
             goal_reward=compute_reward_of(self.envs[index]) if self._hindsight else None,
+            goal_end=compute_terminated_of(self.envs[index]) if self._hindsight else None,
         )
         recording.see(observation)
         self._callbacks.episode_started(index, observation, info)

@@ -453,6 +453,19 @@ def register_uneven() -> None:
     tune.register_env("Uneven", uneven)
 
 
+def test_hindsight_ends_transitions_of_a_maze_at_their_new_goal() -> None:
+    maze = {"continuing_task": False, "max_episode_steps": 50}
+    tune.register_env("Maze", lambda context: make_env("PointMaze_UMaze-v3", **maze))
+    algo = build("Maze", **HER)
+    algo.train()
+    batch = algo.replay.sample_transitions(500)
+    position, goal = np.split(batch.next_inputs[:, [0, 1, 4, 5]], 2, axis=1)
+    reached = np.linalg.norm(position - goal, axis=1) <= 0.45
+    assert 0.1 < reached.mean() < 0.9
+    np.testing.assert_array_equal(batch.discounts == 0, reached)
+    np.testing.assert_array_equal(batch.rewards == 1, reached)
+
+
 def test_the_bound_on_fresh_episodes_is_taken_over_all_of_them(tmp_path: Path) -> None:
     register_uneven()
     algo, resumed = (build("Uneven", music=MUSIC_U) for _ in range(2))

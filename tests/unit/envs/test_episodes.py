@@ -9,7 +9,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from music_rllib.envs.episodes import Recording, first_mismatch, lost_by_rounding
-from music_rllib.envs.make import goal_reward_of
+from music_rllib.envs.make import goal_end_of, goal_reward_of
 from music_rllib.envs.values import BadNumberError
 from music_rllib.replay.trajectories import ReplayLayout
 
@@ -232,3 +232,87 @@ def test_a_reward_that_changes_its_arguments_does_not_change_the_replay() -> Non
     kept = np.ones((3, 2), np.float32)
     np.testing.assert_array_equal(reward(kept, kept), reward(kept[:1], kept))
     np.testing.assert_array_equal(kept, 1)
+
+
+class Ends(Reach):
+    """Ends an episode within 0.05 of the goal, as computed for batches or for single goals."""
+
+    def __init__(self, end: Any) -> None:
+        super().__init__(0.0)
+        self.end = end
+
+    def compute_terminated(self, achieved: Floats, desired: Floats, info: Any) -> Any:
+        return self.end(achieved, desired)
+
+
+def near(achieved: Floats, desired: Floats) -> Any:
+    return np.linalg.norm(achieved - desired, axis=-1) < 0.05
+
+
+def near_alone(achieved: Floats, desired: Floats) -> bool:
+    return bool(np.linalg.norm(achieved - desired) < 0.05)  # of a batch: one bool
+
+
+def near_one(achieved: Floats, desired: Floats) -> bool:
+    return bool(np.hypot(*(achieved - desired)) < 0.05)  # raises for a batch
+
+
+@pytest.mark.parametrize("end", [near, near_alone, near_one])
+def test_the_end_at_a_goal_is_computed_for_each_row(end: Any) -> None:
+    ends = goal_end_of(Ends(end))
+    assert ends is not None
+    achieved = np.zeros((3, 2), np.float32)
+    desired = np.array([[0.0, 0.04], [0.0, 1.0], [0.01, 0.0]], np.float32)
+    assert ends(achieved, desired).tolist() == [True, False, True]
+
+
+def test_an_environment_that_never_ends_at_a_goal_has_no_function_for_it() -> None:
+    assert goal_end_of(Reach(0.0)) is None
+    assert goal_end_of(Ends(lambda achieved, desired: False)) is None
+
+
+@pytest.mark.parametrize(
+    ("end", "reason"),
+    [
+        (
+            lambda achieved, desired: dict[str, Any]()["is_success"],
+            "it raises KeyError: 'is_success'",
+        ),
+        (lambda *goals: 0.5, "must be a bool, or the number 0 or 1, got 0.5"),
+    ],
+)
+def test_an_end_that_depends_on_more_than_goals_is_refused(end: Any, reason: str) -> None:
+    with pytest.raises(ValueError, match="hindsight_k must be 0 if compute_terminated") as error:
+        goal_end_of(Ends(end))
+    assert reason in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("places", "terminated", "found"),
+    [
+        ([0.3, 0.2, 0.01], True, None),
+        ([0.3, 0.2, 0.3], True, None),  # another reason
+        ([0.3, 0.2, 0.3], False, None),
+        ([0.3, 0.05 - 1e-9, 0.3], False, None),  # rounding
+        ([0.3, 0.2, 0.01], False, "step 3"),
+        ([0.3, 0.01, 0.3], False, "step 2"),
+        ([0.3, 0.01, 0.3], True, "step 2"),
+    ],
+)
+def test_episodes_end_where_compute_terminated_is_true(
+    places: list[float], terminated: bool, found: str | None
+) -> None:
+    goal = {"desired_goal": np.zeros(2)}
+    recording = Recording(ReplayLayout(2, 2, 2, 5), name="Ends", goal_reward=sparse, goal_end=near)
+    for number, place in enumerate([1.0, *places]):
+        at = np.array([place, 0.0])
+        seen = {"observation": at, "achieved_goal": at, **goal}
+        if number:
+            recording.step(np.zeros(2, np.float32), sparse(at, goal["desired_goal"]), {}, seen)
+        else:
+            recording.see(seen)
+    if found is None:
+        assert recording.finish(terminated=terminated).terminated == terminated
+        return
+    with pytest.raises(BadNumberError, match=f"{found}: .*if episodes continue where"):
+        recording.finish(terminated=terminated)

@@ -71,6 +71,30 @@ def test_a_sound_environment_has_no_problems_or_remarks(monkeypatch: pytest.Monk
     assert (made.problems, made.remarks) == ([], [])
 
 
+def test_ends_at_the_goal_need_a_function_of_goals(monkeypatch: pytest.MonkeyPatch) -> None:
+    ends = changed(lambda env, seen, reward, *rest: (seen, reward, reward == 0, *rest[1:]))
+    made = probed(monkeypatch, ends, hindsight=True)
+    assert made.problems == []
+    assert made.remarks == [
+        "step() terminates episodes; if it does so at the goal, hindsight needs "
+        "compute_terminated(achieved_goal, desired_goal, info), or relabeled transitions do not "
+        "end at their new goal"
+    ]
+    assert probed(monkeypatch, ends).remarks == []
+
+    class Ends(ends):  # type: ignore[misc,valid-type]
+        reached = 0.0
+
+        def compute_terminated(self, *goals: Any) -> Any:
+            return self.compute_reward(*goals) == self.reached
+
+    made = probed(monkeypatch, Ends, hindsight=True)
+    assert (made.problems, made.remarks) == ([], [])
+    Ends.reached = -1.0
+    (problem,) = probed(monkeypatch, Ends, hindsight=True).problems
+    assert "episodes continue where compute_terminated is True" in problem
+
+
 def bonus(env: Sound, seen: Any, reward: float, *rest: Any) -> Any:
     return seen, reward + 10.0 * (reward == 0), *rest
 

@@ -145,6 +145,35 @@ def test_n_steps_add_the_rewards_of_the_relabeled_goal_up_to_the_end(
         np.testing.assert_array_equal(batch.actions[row], [number, step])
 
 
+@pytest.mark.parametrize("n_steps", [1, 3])
+def test_relabeled_transitions_end_where_their_new_goal_is_reached(n_steps: int) -> None:
+    """Episodes that end at their goal, at another state (a fall), or by their length."""
+    gamma, lengths, ends = 0.5, (3, 4, 5), (True, True, False)
+    played = [episode(n, s, terminated=end) for n, (s, end) in
+              enumerate(zip(lengths, ends, strict=True))]  # fmt: skip
+    played[0].frames[:, 3] = played[0].frames[-1, 4]
+    played[0].rewards[-1] = 0.0
+    buffer = replay(
+        100, hindsight_k=4.0, hindsight_goals="episode", n_steps=n_steps, gamma=gamma,
+        goal_end=lambda achieved, desired: matches(achieved, desired) == 0,
+    )  # fmt: skip
+    buffer.extend(played)
+    batch = buffer.sample_transitions(2_000)
+    for row in range(2_000):
+        number, step = (int(value) for value in batch.inputs[row, :2])
+        goal, achieved = batch.inputs[row, 3], played[number].frames[1:, 4]
+        ended = achieved == goal
+        ended[-1] |= number == 1  # a fall ends an episode with any goal
+        after = next(
+            (t for t in range(step, lengths[number]) if ended[t] or t == step + n_steps - 1),
+            lengths[number] - 1,
+        )
+        rewards = [-(gamma ** (t - step)) * (achieved[t] != goal) for t in range(step, after + 1)]
+        assert batch.rewards[row] == pytest.approx(sum(rewards))
+        assert batch.discounts[row] == (0.0 if ended[after] else gamma ** (after - step))
+        np.testing.assert_array_equal(batch.next_inputs[row], [number, after + 1, 0, goal])
+
+
 def resting(number: int, steps: int) -> Trajectory:
     """An episode whose achieved goal never changes."""
     played = episode(number, steps)
