@@ -285,7 +285,10 @@ def _check_not_varied(stage: Mapping[str, Any], key: str, value: Any) -> None:
                 place = f"stages.{stage.get('name')}.{'.'.join(group)}.{name}"
                 rule = f"{key} must not be given where {place} varies it"
                 if group == ("grid",) and name == key:
-                    rule += f"; {place}='[{shown(value)}]' replaces its values"
+                    # A list is several values, unless a value is a list, as of hidden_sizes.
+                    lists = any(isinstance(one, list) for one in choices)
+                    values = value if isinstance(value, list) and not lists else [value]
+                    rule += f"; {place}='{shown(values)}' replaces its values"
                 raise _refusal(rule)
 
 

@@ -6,6 +6,7 @@ Validation does not stop at the first problem, so that a file can be corrected i
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
@@ -225,6 +226,7 @@ _FIXED_RULES = {
     "string_too_short": "must not be empty",
     "missing": "must be given",
 }
+_WORDS = re.compile(r"[\w.-]+(, ?[\w.-]+)*")
 _COMPARISONS = {
     "greater_than": (">", "gt"),
     "greater_than_equal": (">=", "ge"),
@@ -239,6 +241,8 @@ def _rule(details: ErrorDetails) -> str:
     hint = ""
     if kind in _FIXED_RULES:
         rule = _FIXED_RULES[kind]
+        if rule == "must be a list" and isinstance(value, str) and _WORDS.fullmatch(value):
+            hint = f" (did you mean '[{value}]'?)"
     elif kind in _COMPARISONS:
         sign, bound = _COMPARISONS[kind]
         rule = f"must be {sign} {context[bound]:g}"
@@ -248,7 +252,8 @@ def _rule(details: ErrorDetails) -> str:
             options = context["expected"].replace(" or ", ", ").split(",")
             hint = closest(value, [option.strip("' ") for option in options])
     elif kind == "too_short":
-        rule = f"must have at least {context['min_length']} entries"
+        least = context["min_length"]
+        rule = "must not be empty" if least == 1 else f"must have at least {least} entries"
     elif kind == "too_long":
         rule = f"must have at most {context['max_length']:,} entries"
     elif kind == "value_error":

@@ -155,6 +155,7 @@ Dimension = Annotated[
     Discriminator(
         _tag,
         custom_error_type="dimension",
-        custom_error_message="must have exactly one of float, int and choice",
+        custom_error_message="must have exactly one of float, int and choice, like "
+        "{float: [0.01, 1], log: true}",
     ),
 ]

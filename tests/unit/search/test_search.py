@@ -183,7 +183,7 @@ MISTAKES: list[tuple[Document, str]] = [
     ),
     (
         {"space": {"tac.alpha": {"flaot": [0.0, 0.1]}}},
-        "search.space.tac.alpha must have exactly one of float, int and choice",
+        "search.space.tac.alpha must have exactly one of float, int and choice, like {float: ",
     ),
     (
         {"space": {"tac.entropic_index": {"float": [0, 2]}}},
