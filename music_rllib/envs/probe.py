@@ -62,10 +62,13 @@ _SIMILAR = 0.85
 
 
 class Question(BaseModel):
-    """A task, and the values of `replay.hindsight_episodes` of its runs that use hindsight."""
+    """A task, and what its runs use."""
 
     task: Task
     hindsight: tuple[str, ...] = ()
+    """Values of `replay.hindsight_episodes` of the runs that use hindsight."""
+    intrinsic: bool = False
+    """Whether a run has MUSIC's or another intrinsic reward."""
 
 
 class Request(BaseModel):
@@ -89,6 +92,7 @@ class Probe:
 
     def __init__(self, question: Question, watch: Callable[[str], None]) -> None:
         self._task, self._hindsight, self._watch = question.task, question.hindsight, watch
+        self._intrinsic = question.intrinsic
         self.problems: list[str] = []
         """Reasons to refuse the task."""
         self.remarks: list[str] = []
@@ -341,6 +345,13 @@ class Probe:
                 "step() terminates episodes; if it does so at the goal, hindsight needs "
                 "compute_terminated(achieved_goal, desired_goal, info), or relabeled transitions "
                 "do not end at their new goal"
+            )
+        if self._terminates and self._intrinsic:
+            self.remarks.append(
+                "step() terminates episodes, and intrinsic rewards lie in [-1, 0]: a policy earns "
+                "more of them by ending an episode early. If the end is a failure, use an "
+                "environment that continues (env_kwargs: {terminate_when_unhealthy: false} in many "
+                "of Gymnasium's)"
             )
         self.remarks += (f"{line}; the networks get float32" for line in sorted(self._types))
         if unused := self._unused - {*GOAL_KEYS}:

@@ -67,6 +67,7 @@ def check_environments(plan: Plan, hang_minutes: float | None = None) -> list[st
         if run.replay.hindsight_k > 0:
             episodes = {*question.hindsight, run.replay.hindsight_episodes}
             question.hindsight = tuple(sorted(episodes))
+        question.intrinsic |= run.music.estimator != "none" or run.intrinsic.reward is not None
     problems, remarks = [], []
     while left:  # the child process ends early at an environment that ends it
         for name, wrong, noteworthy in _play([*left.values()], hang_minutes):

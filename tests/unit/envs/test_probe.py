@@ -40,7 +40,12 @@ class Sound(gym.Env[Any, Any]):
 
 
 def probed(
-    monkeypatch: pytest.MonkeyPatch, kind: type[Sound], *, hindsight: bool = False, **task: Any
+    monkeypatch: pytest.MonkeyPatch,
+    kind: type[Sound],
+    *,
+    hindsight: bool = False,
+    intrinsic: bool = False,
+    **task: Any,
 ) -> Probe:
     monkeypatch.setattr(probe, "MOST_STEPS", 3000)
     monkeypatch.setattr(probe, "MOST_SECONDS", 60.0)  # on a busy machine too
@@ -49,7 +54,8 @@ def probed(
     gym.register(name, entry_point=lambda **_: kind(), max_episode_steps=20)
     try:
         declared = Task(name="T", env_id=name, horizon=20, **task)
-        made = Probe(Question(task=declared, hindsight=("all",) * hindsight), lambda call: None)
+        asked = Question(task=declared, hindsight=("all",) * hindsight, intrinsic=intrinsic)
+        made = Probe(asked, lambda call: None)
         made.run()
     finally:
         del gym.registry[name]
@@ -93,6 +99,14 @@ def test_ends_at_the_goal_need_a_function_of_goals(monkeypatch: pytest.MonkeyPat
     Ends.reached = -1.0
     (problem,) = probed(monkeypatch, Ends, hindsight=True).problems
     assert "episodes continue where compute_terminated is True" in problem
+
+
+def test_intrinsic_rewards_make_an_early_end_attractive(monkeypatch: pytest.MonkeyPatch) -> None:
+    falls = changed(lambda env, *step: (*step[:2], abs(env.at[0]) > 0.5, *step[3:]))
+    (remark,) = probed(monkeypatch, falls, intrinsic=True).remarks
+    assert "a policy earns more of them by ending an episode early" in remark
+    assert probed(monkeypatch, falls).remarks == []
+    assert probed(monkeypatch, Sound, intrinsic=True).remarks == []
 
 
 def bonus(env: Sound, seen: Any, reward: float, *rest: Any) -> Any:
