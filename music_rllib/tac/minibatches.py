@@ -16,7 +16,7 @@ I network inputs, D observation, A actions.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -73,7 +73,7 @@ class Minibatches(NamedTuple):
 
     columns: Minibatch
     """[K*B, ...] transitions of the policy's module, [K*N, ...] of the estimator's."""
-    drawn: Sequence[Hashable]
+    drawn: Sequence[tuple[bool, ...]]
     """[K] values drawn by MUSIC."""
 
     @property
@@ -113,6 +113,8 @@ class Minibatches(NamedTuple):
             if len(kinds) > 1:
                 alike = torch.tensor([k for k, other in enumerate(self.drawn) if other == drawn])
             before, after = (values[alike].flatten(0, 1) for values in (states, followers))
-            found = music.reward(before, after, drawn)
+            # Each draw is for an equal share of the rows of one update.
+            draws = drawn if len(drawn) == 1 else drawn * (len(before) // states.shape[1])
+            found = music.reward(before, after, draws)
             rewards[alike] = found.unflatten(0, (-1, states.shape[1]))
         return rewards
