@@ -54,6 +54,7 @@ WANTED = (
     names.GRAD_UPDATES,
     names.SYSTEM_SECONDS,
     names.Q_MEAN,
+    names.TRAIN_DISPLACEMENT,
     names.ALPHA,
     names.MI_REWARD_WEIGHT,
 )

@@ -76,10 +76,13 @@ def planned_in_words(study: Study) -> str:
     """Whether there was a plan before the results."""
     plan, latest = study.plan, study.latest
     if plan is not None:
+        first = "the first run of each new hypothesis" if study.before else "its first run"
         text = (
-            f"planned {plan.recorded}, before its first run finished; version {plan.version}, "
+            f"planned {plan.recorded}, before {first} finished; version {plan.version}, "
             f"hash {plan.hash[:12]}"
         )
+        for number, count in Counter(one.version for one in study.before.values()).items():
+            text += f"; {count} already in version {number}"
         if study.late:
             text += f"; not planned, because runs of it had finished: {', '.join(study.late)}"
         changed = [] if latest is None else _changed(plan.plan, latest.plan)

@@ -340,12 +340,23 @@ def _complete(columns: Sequence[Scores]) -> dict[str, float]:
 
 
 def decided(claims: Sequence[Claim], *, planned: bool, without_test: int = 0) -> tuple[Claim, ...]:
-    """The claims with adjusted p-values and verdicts, as one family with those without a test."""
-    p_values = adjusted([claim.contrast.p_values for claim in claims], without_test)
-    return tuple(
-        _decided(replace(claim, p_value=p_value, p_equivalent=p_equivalent, planned=planned))
-        for claim, (p_value, p_equivalent) in zip(claims, p_values, strict=True)
+    """The claims with adjusted p-values and verdicts, as one family with those without a test.
+
+    An unfinished claim counts with p = 1: its interim p-value must not help the others.
+    """
+    ended = [claim for claim in claims if not claim.unfinished]
+    p_values = iter(
+        adjusted(
+            [claim.contrast.p_values for claim in ended], without_test + len(claims) - len(ended)
+        )
     )
+    found = []
+    for claim in claims:
+        none = None if claim.contrast.p_equivalent is None else 1.0
+        p_value, p_equivalent = (1.0, none) if claim.unfinished else next(p_values)
+        one = replace(claim, p_value=p_value, p_equivalent=p_equivalent, planned=planned)
+        found.append(_decided(one))
+    return tuple(found)
 
 
 def exploratory(claims: Sequence[Claim]) -> tuple[Claim, ...]:

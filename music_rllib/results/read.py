@@ -74,7 +74,11 @@ def read_sweep(
     """
     folder = folder_at(place)
     if folder is not None and is_archive(folder):
-        return SweepRead(sweep=read_archive(folder), folder=folder)
+        sweep = read_archive(folder)
+        if metrics is not None:
+            own = {name: column for name, column in sweep.history.items() if name in metrics}
+            sweep = replace(sweep, history=own)
+        return SweepRead(sweep=sweep, folder=folder)
     location = find_sweep(place, None if "/" in place else storage)
     return read_stored(location, metrics=metrics, lenient=lenient)
 

@@ -8,13 +8,14 @@ and an unadjusted p-value.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
 
+from music_rllib import names
 from music_rllib.config.schema import Hypothesis, same_value
 from music_rllib.results import statistics as st
 from music_rllib.results.analysis_plan import PlanVersion
@@ -59,6 +60,8 @@ class Study:
     plan: PlanVersion | None
     """The last version recorded before the first run of its hypotheses, or of some of them, had
     finished; None without one."""
+    before: Mapping[str, PlanVersion]
+    """Hypotheses of `plan` that an earlier version planned in time, and `plan` no longer."""
     latest: PlanVersion | None
     means: tuple[Mean, ...]
     planned: tuple[Claim, ...]
@@ -105,7 +108,7 @@ def study_of(
     """
     stages = {found.name: found for found in find_stages(sweep)}
     latest = sweep.plans[-1] if sweep.plans else None
-    plan, late = _plan_before_results(sweep, stages)
+    plan, before, late = _plan_before_results(sweep, stages)
     chosen = stages.get(stage or (latest.plan.stage if latest else ""))
     if chosen is None and stage is None:
         chosen = next((s for s in reversed(stages.values()) if s.has_task_reward), None)
@@ -113,9 +116,9 @@ def study_of(
     if latest and not pairs and stage in (None, latest.plan.stage):
         of_hypotheses = [found for name, found in stages.items() if name in latest.plan.stages]
         chosen = stages_together(of_hypotheses) or chosen
-    untested: list[str] = []
+    untested: dict[str, int] = {}
     planned = list(_of_plan(sweep, stages, plan, late, untested)) if plan else []
-    without_test = len(untested)
+    without_test = sum(untested.values())
     unplanned: list[Claim] = []
     if plan is not None and late:
         in_time = [text for text in plan.plan.hypotheses if text not in late]
@@ -139,20 +142,27 @@ def study_of(
         means += _means(counted_sweep, chosen, measures)
         labelled = [(x.short_label, y.short_label, [(x, y)]) for x, y in pairs]
         known_subjects = {claim.subject for claim in (*planned, *unplanned)}
-        of_stage = claims_of(counted_sweep, labelled, measures, margin)
+        of_stage = list(claims_of(counted_sweep, labelled, measures, margin))
         unplanned += [claim for claim in of_stage if claim.subject not in known_subjects]
+        if plan is None:
+            without_test = len(pairs) * _scopes(sweep, chosen.tasks) - len(of_stage)
     of_plan = [stages[name] for name in (plan.plan.stages if plan else ()) if name in stages]
     compared = [run for one in filter(None, [chosen, *of_plan]) for run in _runs(one)]
     return Study(
         stage=chosen,
         plan=plan,
+        before=before,
         latest=latest,
         means=tuple(means),
         late=late,
         planned=decided(planned, planned=True, without_test=without_test),
-        unplanned=exploratory(unplanned) if plan else decided(unplanned, planned=False),
-        untested=tuple(dict.fromkeys(untested)),
-        family=len(planned) + without_test if plan else len(unplanned),
+        unplanned=(
+            exploratory(unplanned)
+            if plan
+            else decided(unplanned, planned=False, without_test=without_test)
+        ),
+        untested=tuple(untested),
+        family=len(planned if plan else unplanned) + without_test,
         runs=tuple(dict.fromkeys(compared)),
     )
 
@@ -164,24 +174,45 @@ def _runs(stage: StageRuns) -> list[int]:
 
 def _plan_before_results(
     sweep: Sweep, stages: Mapping[str, StageRuns]
-) -> tuple[PlanVersion | None, tuple[str, ...]]:
-    """The last version of the plan that was recorded before results, and its late hypotheses.
+) -> tuple[PlanVersion | None, dict[str, PlanVersion], tuple[str, ...]]:
+    """The last version of the plan that was recorded before results.
 
-    A hypothesis is late if a run of its stages had finished, as one that an earlier sweep trained.
-    A version without late hypotheses comes before a later one with some.
+    A hypothesis is late if a run of its stages had finished, as one that an earlier sweep trained,
+    unless an earlier version had planned the same comparison in time. A version without late
+    hypotheses comes before a later one with some, unless that one repeats all of its hypotheses.
+
+    Returns:
+        The version, its hypotheses that only earlier versions planned in time, and its late ones.
     """
-    found: tuple[PlanVersion | None, tuple[str, ...]] = (None, ())
-    for version in reversed(sweep.plans):
-        first = {
-            text: first_result(sweep, (r for name in of & stages.keys() for r in stages[name].runs))
-            for text, of in version.plan.stages_of_hypotheses.items()
-        }
-        late = tuple(text for text, time in first.items() if version.recorded_ms >= time)
-        if not late:
-            return version, ()
-        if found[0] is None and len(late) < len(first):
-            found = version, late
+    found: tuple[PlanVersion | None, dict[str, PlanVersion], tuple[str, ...]] = (None, {}, ())
+    for number, version in reversed([*enumerate(sweep.plans)]):
+        before, late = {}, []
+        for text, of in version.plan.stages_of_hypotheses.items():
+            runs = (run for name in of & stages.keys() for run in stages[name].runs)
+            time, earlier = first_result(sweep, runs), sweep.plans[:number]
+            same = [one for one in earlier if version.plan.repeats(text, one.plan)]
+            if version.recorded_ms < time:
+                continue
+            if same and same[0].recorded_ms < time:
+                before[text] = same[0]
+            else:
+                late.append(text)
+        if len(before) + len(late) == len(version.plan.hypotheses):
+            continue
+        later = found[0]
+        if later is None or not (
+            late or all(later.plan.repeats(text, version.plan) for text in version.plan.hypotheses)
+        ):
+            found = version, before, tuple(late)
+        if not found[2]:
+            break
     return found
+
+
+def _scopes(sweep: Sweep, tasks: Collection[str]) -> int:
+    """Number of comparisons of two conditions: on each task, and on all if they have rates."""
+    rates = {sweep.primary_metric(run.task) for run in sweep.runs if run.task in tasks}
+    return len(tasks) + (len(tasks) > 1 and rates <= names.EVAL_RATES)
 
 
 def _of_plan(
@@ -189,37 +220,38 @@ def _of_plan(
     stages: Mapping[str, StageRuns],
     version: PlanVersion,
     known: Sequence[str],
-    untested: list[str],
+    untested: dict[str, int],
 ) -> Iterator[Claim]:
-    """The undecided claims of a plan's hypotheses without the `known` ones; fills `untested`."""
-    sweep = counted(sweep, version.plan.metric)
-    for text in version.plan.hypotheses:
+    """The undecided claims of a plan's hypotheses without the `known` ones.
+
+    Fills `untested` with reasons and the number of comparisons that can't be tested.
+    """
+    plan, with_runs = version.plan, {run.task for run in sweep.runs}
+    sweep = counted(sweep, plan.metric)
+    for text, of in plan.stages_of_hypotheses.items():
         if text in known:
             continue
         hypothesis = Hypothesis.of(text)
+        tasks = {run.task for run in sweep.runs if run.stage in of} | plan.budget.keys() - with_runs
+        scopes = _scopes(sweep, tasks)
         sides = (hypothesis.first, hypothesis.second)
-        first, second = (_matching(sweep, stages, side, version.plan.stage) for side in sides)
+        first, second = (_matching(sweep, stages, side, plan.stage) for side in sides)
         pairs = _equal_in_the_rest(first, second, hypothesis)
         if isinstance(pairs, str):
-            untested.append(f"{text}: {pairs}")
+            untested[f"{text}: {pairs}"] = scopes
             continue
         runs = [run for pair in pairs for condition in pair for run in condition.runs]
         measures = {
-            task: measure_on(
-                sweep,
-                task,
-                runs,
-                version.plan.metric,
-                horizon=version.plan.budget.get(task, np.inf),
-            )
+            task: measure_on(sweep, task, runs, plan.metric, horizon=plan.budget.get(task, np.inf))
             for task in dict.fromkeys(sweep.runs[run].task for run in runs)
         }
         labelled = (_in_words(hypothesis.first), _in_words(hypothesis.second), pairs)
-        claims = list(
-            claims_of(sweep, [labelled], measures, version.plan.margin, version.plan.seed_count)
-        )
-        if not claims:
-            untested.append(f"{text}: no seed has finished in both conditions")
+        claims = list(claims_of(sweep, [labelled], measures, plan.margin, plan.seed_count))
+        if len(claims) < scopes:
+            left = sorted(tasks - {claim.task for claim in claims})
+            where = f" on {', '.join(left)}" if claims else ""
+            reason = "no seed has finished in both conditions"
+            untested[f"{text}{where}: {reason}"] = scopes - len(claims)
         yield from (replace(claim, hypothesis=hypothesis) for claim in claims)
 
 

@@ -247,6 +247,41 @@ def test_a_plan_that_changes_after_a_result_keeps_its_planned_claims(
     assert "changed afterwards: hypotheses, margin)" in answer(sweep_of(runs, both), found)[0]
 
 
+def test_a_hypothesis_is_planned_by_the_first_version_that_has_it(
+    rng: np.random.Generator,
+) -> None:
+    """A stage and a hypothesis about it are added when an earlier stage has finished."""
+    train = study({"1": 0.2, "1.5": 0.4}, 8, rng)
+    tune = [
+        run({"tac.entropic_index": q}, seed, height, rng, stage="tune")
+        for q, height in (("1", 0.2), ("1.5", 0.4))
+        for seed in range(8)
+    ]
+    later = [
+        (record, points._replace(times=[DONE + 5] * len(points.times))) for record, points in tune
+    ]
+    old, new = "q = 1.5 against q = 1", "stage = tune, q = 1.5 against stage = tune, q = 1"
+    first = with_plan((), plan(old), DONE - 1)
+
+    def planned(*hypotheses: str, **changes: Any) -> tuple[list[str], str]:
+        versions = with_plan(first, plan(*hypotheses, **changes), DONE + 1)
+        sweep = sweep_of([*train, *later], versions)
+        found = study_of(sweep)
+        texts = [one.hypothesis.text for one in found.planned if one.hypothesis]
+        assert all(one.verdict is Verdict.SUPERIOR for one in found.planned)
+        return texts, answer(sweep, found)[0]
+
+    texts, said = planned(old, new)
+    assert texts == [old, new]
+    assert "before the first run of each new hypothesis finished; version 2" in said
+    assert "1 already in version 1" in said
+    # A hypothesis about the finished stage, or another test of it, comes too late.
+    assert planned(old, new, "q = 1.5 better than q = 1")[0] == [old, new]
+    assert planned(old, new, margin=0.1)[0] == [old]
+    assert planned(old, new, seeds="0, 1")[0] == [old]
+    assert planned(new)[0] == [new]
+
+
 def test_settings_that_a_hypothesis_does_not_name_are_averaged(rng: np.random.Generator) -> None:
     runs = [
         run({"tac.entropic_index": q, "tac.alpha": alpha}, seed, height, rng)
@@ -370,6 +405,50 @@ def test_a_condition_without_results_counts_in_the_family(rng: np.random.Generat
     assert "12 of 18 runs finished" in " ".join(answer(sweep, found))
     assert "q = 2 against q = 1: no seed has finished in both" in found.untested[0]
     assert found.planned[0].p_value == pytest.approx(2 * float(found.planned[0].contrast.p_value))
+
+
+def test_verdicts_do_not_change_when_another_task_or_comparison_finishes(
+    rng: np.random.Generator,
+) -> None:
+    """What is planned and has no result, or an interim one, counts with p = 1."""
+    tasks = ("FetchPush", "FetchSlide")
+    runs = {
+        (task, q): [run({"tac.entropic_index": q}, seed, h, rng, task=task) for seed in range(8)]
+        for task in tasks
+        for q, h in (("1", 0.3), ("1.5", 0.33), ("2", 0.5))
+    }
+    both = plan(
+        "q = 1.5 against q = 1",
+        "q = 2 against q = 1",
+        budget=dict.fromkeys(tasks, BUDGET),
+        seeds=", ".join(map(str, range(8))),
+    )
+    plans = with_plan((), both, DONE - 1)
+
+    def found_with(*parts: tuple[str, str], waiting: str | None = None) -> Study:
+        chosen = [one for part in parts for one in runs[part]]
+        if waiting:
+            some = run({"tac.entropic_index": "1"}, 0, 0.3, rng, task=waiting)[0]
+            chosen.append((replace(some, status="SCHEDULED"), Points()))
+        return study_of(sweep_of(chosen, plans))
+
+    push = found_with(("FetchPush", "1"), ("FetchPush", "1.5"))
+    for found in (push, found_with(("FetchPush", "1"), ("FetchPush", "1.5"), waiting=tasks[1])):
+        (claim,) = found.planned
+        assert found.family == 6
+        assert claim.p_value == pytest.approx(min(1, 6 * float(claim.contrast.p_value)))
+        assert "q = 1.5 against q = 1 on FetchSlide: no seed" in found.untested[0]
+    # Two seeds of q = 2 with a clear difference are not a result yet.
+    chosen = [*runs[tasks[0], "1"], *runs[tasks[0], "1.5"], *runs[tasks[0], "2"][:3]]
+    interim = study_of(sweep_of(chosen, plans)).planned
+    assert interim[0].p_value == push.planned[0].p_value
+    assert (interim[1].p_value, interim[1].verdict) == (1.0, Verdict.NONE)
+    # Without a plan, too.
+    alone = study_of(sweep_of([*runs[tasks[0], "1"], *runs[tasks[0], "1.5"]]))
+    assert alone.family == 1
+    of_slide = [(replace(one, status="SCHEDULED"), Points()) for one, _ in runs[tasks[1], "1"]]
+    more = study_of(sweep_of([*runs[tasks[0], "1"], *runs[tasks[0], "1.5"], *of_slide]))
+    assert (more.family, len(more.unplanned)) == (3, 1)
 
 
 def test_failed_runs_have_the_worst_score_and_unfinished_ones_block_a_verdict(
