@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from music_rllib import names
 from music_rllib.results.analysis_plan import AnalysisPlan, is_controlled
 from music_rllib.results.claims import FEWEST_SEEDS, Claim, Verdict
-from music_rllib.results.conditions import ALL_TASKS, StageRuns
+from music_rllib.results.conditions import ALL_TASKS, Condition, StageRuns
 from music_rllib.results.data import Sweep
 from music_rllib.results.statistics import (
     MAX_SEEDS,
@@ -232,17 +232,21 @@ def power_in_words(claims: Sequence[Claim], means: Sequence[Mean], family: int) 
             f"All conditions are within {margin:g} of a bound, where seeds differ less than "
             "elsewhere: their spread does not show how many seeds are needed."
         )
-    bounded = {(mean.condition, mean.task) for mean in means if _at_a_bound(mean, margin)}
+    # By their runs: of stages side by side, a condition of a mean has the stage, too.
+    bounded = {(mean.condition.runs, mean.task) for mean in means if _at_a_bound(mean, margin)}
+    tasks = {mean.task for mean in means}
+
+    def is_bounded(side: Iterable[Condition], task: str) -> bool:
+        over = tasks if task == ALL_TASKS else {task}
+        return all((one.runs, each) in bounded for one in side for each in over)
+
     clear = [
         claim.contrast
         for claim in claims
         if claim.margin is not None
         and np.isfinite(claim.contrast.spread)
         and min(claim.contrast.seeds) >= FEWEST_FOR_SPREAD
-        and not any(
-            all((condition, claim.task) in bounded for condition in side)
-            for side in zip(*claim.pairs, strict=True)
-        )
+        and not any(is_bounded(side, claim.task) for side in zip(*claim.pairs, strict=True))
     ]
     if not clear:
         return None

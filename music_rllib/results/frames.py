@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,10 +21,11 @@ if TYPE_CHECKING:
 
 
 _SETTINGS = {
-    "q": names.SETTING_ENTROPIC_INDEX,
-    "alpha": names.SETTING_ALPHA,
-    "mi_reward_weight": names.SETTING_MI_REWARD_WEIGHT,
+    "q": (names.SETTING_ENTROPIC_INDEX, names.TAG_ENTROPIC_INDEX),
+    "alpha": (names.SETTING_ALPHA, names.TAG_ALPHA),
+    "mi_reward_weight": (names.SETTING_MI_REWARD_WEIGHT, names.TAG_MI_REWARD_WEIGHT),
 }
+"""Settings that can be schedules: metric with the value at step 0, and tag with the words."""
 _RUN_COLUMNS = {
     **dict.fromkeys(("name", "stage", "variant", "task", "condition"), "str"),
     "seed": "Int64",
@@ -109,7 +111,7 @@ def _runs(sweep: Sweep, keys: list[str]) -> pd.DataFrame:
                 **{name: getattr(run, name) for name in ("name", "stage", "variant", "task")},
                 "condition": labels[position],
                 "seed": run.seed,
-                **{name: sweep.final(position, setting) for name, setting in _SETTINGS.items()},
+                **{name: _at_start(sweep, position, name) for name in _SETTINGS},
                 "status": run.status,
                 "started": run.started,
                 "ended": run.ended,
@@ -131,6 +133,16 @@ def _runs(sweep: Sweep, keys: list[str]) -> pd.DataFrame:
     return frame.set_index(pd.Index(keys, name="key", dtype="str"))
 
 
+def _at_start(sweep: Sweep, run: int, setting: str) -> float | None:
+    """A setting at step 0; of a run without a report the number at the beginning of its words."""
+    metric, tag = _SETTINGS[setting]
+    value = sweep.final(run, metric)
+    if value is None:
+        with suppress(ValueError):
+            return float(sweep.runs[run].tags.get(tag, "").split(" ")[0])
+    return value
+
+
 def _typed(texts: pd.Series[Any]) -> Any:
     """A column of numbers if all texts are numbers, else of texts."""
     try:
@@ -150,12 +162,13 @@ def _conditions(sweep: Sweep) -> Iterator[dict[str, Any]]:
         for scope in analysis.scopes:
             for final in scope.finals:
                 condition = final.condition
+                at_start = (_at_start(sweep, run, "q") for run in condition.runs)
                 row = {
                     "stage": analysis.stage.name,
                     "variant": analysis.stage.variant,
                     "task": scope.name,
                     "condition": condition.label,
-                    "q": sweep.final(condition.runs[0], names.SETTING_ENTROPIC_INDEX),
+                    "q": next(filter(None, at_start), None),
                     "metric": scope.metric,
                     "seeds": final.seeds,
                     "runs": final.runs,

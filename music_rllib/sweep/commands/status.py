@@ -192,7 +192,7 @@ def compare(
         ),
     ] = None,
     minimize: Annotated[
-        bool, typer.Option("--minimize", help="Lower values of the metric are better.")
+        bool, typer.Option("--minimize", help="Lower values of --metric are better.")
     ] = False,
     json: Json = False,
 ) -> int:
@@ -200,6 +200,8 @@ def compare(
     from music_rllib.experiment.sweep_files import find_sweep
     from music_rllib.sweep.views.compare import compare_stage
 
+    if minimize and metric is None:
+        raise BadInputError("--minimize must be given with the --metric whose lower values count")
     found = find_sweep(sweep, storage)
     document, view = compare_stage(found, stage, metric, minimize=minimize)
     if json:

@@ -66,6 +66,19 @@ def test_frames_without_runs_have_the_same_types() -> None:
         assert dict(frame.dtypes) == dict(getattr(whole, name).dtypes[frame.columns])
 
 
+def test_a_failed_run_without_a_report_keeps_its_q() -> None:
+    """Otherwise it is missing in `groupby("q")`, and only there."""
+    sweep = read_archive(EXPORT)
+    history = {
+        name: column.select(column.run != 0) if name.startswith("setting") else column
+        for name, column in sweep.history.items()
+    }
+    whole, lacking = frames_of(sweep), frames_of(replace(sweep, history=history))
+    columns = ["q", "alpha", "mi_reward_weight"]
+    pd.testing.assert_frame_equal(lacking.runs[columns], whole.runs[columns])
+    pd.testing.assert_series_equal(lacking.conditions["q"], whole.conditions["q"])
+
+
 def test_the_notebook_reproduces_its_outputs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Run every code cell and compare its output as text."""
     monkeypatch.chdir(DOCS)

@@ -545,6 +545,36 @@ def test_conditions_at_a_bound_do_not_count_for_seeds_needed(
     assert power_in_words(found.planned, found.means, 1) is None
 
 
+def test_stages_and_task_means_at_a_bound_do_not_count_either(rng: np.random.Generator) -> None:
+    def seeds_needed(tasks: Sequence[str], hypothesis: str, stages: Mapping[str, float]) -> Any:
+        runs = [
+            run({"tac.entropic_index": q}, seed, height, rng, stage=stage, task=task)
+            for stage, height in stages.items()
+            for q in ("1", "1.5")
+            for task in tasks
+            for seed in range(5)
+        ]
+        versions = with_plan((), plan(hypothesis, stage=next(iter(stages))), 5)
+        found = study_of(sweep_of(runs, versions))
+        (claim, *_) = found.planned
+        return power_in_words([claim], found.means, 1)
+
+    between = "stage = a, q = 1 against stage = b, q = 1"
+    assert seeds_needed(["FetchPush"], between, {"a": 0.3, "b": 0.3}) is not None
+    between_q = "q = 1.5 against q = 1"
+    both = ["FetchPush", "FetchSlide"]
+    assert "spread does not show" in seeds_needed(both, between_q, {"a": 0.0})
+    one_condition = [
+        run({"tac.entropic_index": "1"}, seed, height, rng, stage=stage)
+        for stage, height in (("a", 0.3), ("b", 0.0))
+        for seed in range(5)
+    ]
+    versions = with_plan((), plan("stage = a against stage = b", stage="a"), 5)
+    found = study_of(sweep_of(one_condition, versions))
+    assert len(found.planned) == 1
+    assert power_in_words(found.planned, found.means, 1) is None
+
+
 def test_only_fresh_seeds_of_a_search_are_compared(
     rng: np.random.Generator,
 ) -> None:

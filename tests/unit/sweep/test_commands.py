@@ -197,6 +197,8 @@ def test_status_and_compare(storage: str, tmp_path: Path, program: Program) -> N
     assert "3 runs, entropy -0.32 nats" in in_one_line(program("status", place).output)
     bad = program("compare", place, "--metric", "nonsense")
     assert (bad.code, "--metric must be one of" in bad.errors) == (2, True)
+    bad = program("compare", place, "--minimize")
+    assert (bad.code, "--minimize must be given with the --metric" in bad.errors) == (2, True)
 
 
 def in_one_line(text: str) -> str:
