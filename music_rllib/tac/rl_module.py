@@ -80,7 +80,14 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
 
     A subclass may have other networks. Its `setup` calls this one's, replaces `policy`, `critics`
     or `value` by modules with the same inputs and outputs, and then calls
-    `make_target_networks()`. Set it by `rl_module(rl_module_spec=RLModuleSpec(...))`.
+    `make_target_networks()`, which checks them. Set it by
+    `rl_module(rl_module_spec=RLModuleSpec(...))`.
+
+    - `policy`: [B, I] -> [B, 2A] means and raw log standard deviations, or [B, A] if it is
+      deterministic.
+    - `value`: [B, I] -> [B, 1], with `bootstrap: value`.
+    - `critics`: [B, I + A] -> [C, B], with quantiles [C, B, M]. With the argument `frozen=True`,
+      gradients reach only the inputs.
     """
 
     def setup(self) -> None:
@@ -216,13 +223,48 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
         count = self.settings.quantiles
         if not count:
             return None
-        like = self.critics.weights[0]
+        like = next(self.critics.parameters())
         return (torch.arange(count, dtype=like.dtype, device=like.device) + 0.5) / count
 
     def make_target_networks(self) -> None:
+        """Copy the networks whose averages are bootstrapped from; ValueError for unfit networks."""
+        if type(self) is not TACModule:
+            self._check_networks()
         for name in self._averaged:
             target = copy.deepcopy(getattr(self, name)).requires_grad_(False)
             setattr(self, f"{name}_target", target)
+
+    def _check_networks(self) -> None:
+        """Raise ValueError for networks of other shapes, which would broadcast in the losses."""
+        rows, settings = 3, self.settings
+        quantiles = (settings.quantiles,) if settings.quantiles else ()
+        inputs = torch.zeros(rows, self.input_size)
+        pairs = torch.zeros(rows, self.input_size + self.action_size, requires_grad=True)
+        # In evaluation mode, batch normalization keeps its statistics.
+        critics = copy.deepcopy(self.critics).eval()
+        outputs = self.action_size if self.deterministic else 2 * self.action_size
+        with torch.random.fork_rng(devices=[]):  # a network may draw from it
+            self._check("policy", copy.deepcopy(self.policy).eval()(inputs), rows, outputs)
+            if self._has_value:
+                self._check("value", copy.deepcopy(self.value).eval()(inputs), rows, 1)
+            self._check("critics", critics(pairs), settings.critic_count, rows, *quantiles)
+            frozen = critics(pairs, frozen=True)
+            self._check("critics", frozen, settings.critic_count, rows, *quantiles)
+        gradients = torch.autograd.grad(
+            frozen.sum(), [pairs, *critics.parameters()], allow_unused=True
+        )
+        if [each is not None for each in gradients] != [True, *[False] * (len(gradients) - 1)]:
+            raise ValueError(
+                f"{type(self).__name__}.critics with frozen=True must give gradients to its inputs "
+                "and not to its parameters"
+            )
+
+    def _check(self, name: str, found: Tensor, *shape: int) -> None:
+        if found.shape != shape:
+            raise ValueError(
+                f"{type(self).__name__}.{name} must return the shape {list(shape)} for 3 rows of "
+                f"inputs, got {list(found.shape)}"
+            )
 
     @property
     def _averaged(self) -> tuple[str, ...]:
