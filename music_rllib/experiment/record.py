@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
 from music_rllib.config.run_settings import RunSettings
-from music_rllib.config.schema import SweepConfig
+from music_rllib.config.schema import Stage, SweepConfig
 from music_rllib.errors import BadInputError
 from music_rllib.experiment.open_sweep import FINISHED, OpenSweep, plan_node
 from music_rllib.experiment.plan import Node, budget_settings, make_plan
@@ -226,9 +226,21 @@ def _changed_searches(
             for line in _changed_settings(earlier[stage.name][task], run)
             if not any(f"{stage.name}:{line}".startswith((f"{one}:", f"{one}.")) for one in chosen)
         ]
+        source, now = (_source_of(one.stage(stage.name)) for one in (before, sweep.config) if one)
+        if source != now:
+            lines.append(f"init_from: {source} -> {now}")
         if lines or stage.source_stage in all_changed:
             all_changed.add(stage.name)
             yield stage.name, list(dict.fromkeys(lines))
+
+
+def _source_of(stage: Stage) -> str:
+    """`init_from` of a stage in words; a checkpoint by its hash."""
+    source = stage.source
+    if source is None:
+        return "none"
+    checkpoint = source.checkpoint.manifest.content_hash[:12] if source.checkpoint else None
+    return f"{source.stage or checkpoint}{f' on {source.task.name}' if source.task else ''}"
 
 
 def _why_not_continued(node: Node) -> str:

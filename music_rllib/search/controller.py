@@ -182,11 +182,11 @@ class SearchController(Listener):
         return self._plan.add_trial(search.stage.name, number, study.point(trial), seeds, part)
 
     def _nodes_of(self, run: Node) -> list[Node]:
-        """The node of a run, after the planned node that it starts from, if there is one."""
-        node = self._plan.node(run.key)
-        if node.input is None or node.input.checkpoint is not None:
-            return [node]
-        return [self._plan.node(node.input.key), node]
+        """The node of a run, after the planned nodes that it starts from."""
+        nodes = [self._plan.node(run.key)]
+        while (source := nodes[0].input) is not None and source.checkpoint is None:
+            nodes.insert(0, self._plan.node(source.key))
+        return nodes
 
     def _request(self, run: Node, until: int | None) -> None:
         """Ask for a run up to an environment step; None: to its end."""

@@ -9,7 +9,7 @@ import weakref
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from optuna.exceptions import StorageInternalError
 from optuna.storages import BaseStorage, RDBStorage, get_storage
@@ -19,7 +19,8 @@ from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError, IntegrityError, ProgrammingError, SQLAlchemyError
 
 from music_rllib import names
-from music_rllib.config.schema import Stage
+from music_rllib.config.run_settings import RunSettings
+from music_rllib.config.schema import Stage, SweepConfig
 from music_rllib.config.search import Rung, SearchSettings
 from music_rllib.errors import first_line
 from music_rllib.experiment.open_sweep import OpenSweep
@@ -162,20 +163,46 @@ def _rungs(sweep: OpenSweep, stage: Stage, settings: SearchSettings) -> tuple[Ru
 def _determined_by(sweep: OpenSweep, stage: Stage) -> dict[str, Any]:
     """Plain data of the settings that the stage's runs share, except the searched ones."""
     (point,) = stage.points
-    above = sweep.config.source_of(stage)
-    source_runs = above.points[0].runs if above else {}
-    checkpoint = stage.source.checkpoint if stage.source else None
+    sources = list(_sources_of(sweep.config, stage))
+    nearest = sources[0] if sources else _SourceData({}, None, None)
     # Values of another environment do not count. The earliest stands for all equal ones.
-    codes = {run.code for run in (*point.runs.values(), *source_runs.values())}
-    tasks = sorted(codes & sweep.environments.now.keys())
+    runs = (*point.runs.values(), *(run for one in sources for run in one.runs.values()))
+    tasks = sorted({run.code for run in runs} & sweep.environments.now.keys())
     environments = {task: sweep.environments.earliest(task) for task in tasks}
+    # Only if there are several: studies of earlier versions keep their names.
+    further = [one.document() for one in sources[nearest.task is None :]]
     return {
         **({"environments": environments} if environments else {}),
         "seeds": list(sweep.plan.seeds),
         "runs": {task: node_key(run, None) for task, run in point.runs.items()},
-        "source": {task: node_key(run, None) for task, run in source_runs.items()},
-        "checkpoint": None if checkpoint is None else checkpoint.manifest.content_hash,
+        "source": nearest.document()["runs"],
+        "checkpoint": nearest.checkpoint,
+        **({"sources": further} if further else {}),
     }
+
+
+class _SourceData(NamedTuple):
+    """What a stage's runs start from: settings of runs by task, or the hash of a checkpoint."""
+
+    runs: Mapping[str, RunSettings]
+    task: str | None
+    checkpoint: str | None
+
+    def document(self) -> dict[str, Any]:
+        keys = {task: node_key(run, None) for task, run in self.runs.items()}
+        return {"runs": keys, "task": self.task, "checkpoint": self.checkpoint}
+
+
+def _sources_of(config: SweepConfig, stage: Stage) -> Iterator[_SourceData]:
+    """The source of a stage's runs, the source of that one, and so on."""
+    own: Stage | None = stage
+    while own is not None and (source := own.source) is not None:
+        own = config.source_of(own)
+        yield _SourceData(
+            runs=own.points[0].runs if own else {},
+            task=source.task.name if source.task else None,
+            checkpoint=source.checkpoint.manifest.content_hash if source.checkpoint else None,
+        )
 
 
 # Databases ----------------------------------------------------------------------------------------

@@ -364,6 +364,42 @@ def test_importance_names_the_settings_that_matter(tmp_path: Path) -> None:
     assert sum(arm["importance"].values()) == pytest.approx(1.0)
 
 
+def chain(search: Document, steps: int = 4000, **init_from: Any) -> Document:
+    """Three stages, of which the last one is searched."""
+    first, last = document(search)["stages"]
+    middle = {"name": "middle", "variant": "music-r", "init_from": "pretrain"}
+    source = {"init_from": {"stage": "middle", **init_from}}
+    stages = [first | {"env_steps": steps}, middle, last | {"variant": "music-f"} | source]
+    return document(search, stages=stages, tasks=["FetchPush", "FetchPickAndPlace"])
+
+
+def test_a_search_at_the_end_of_a_chain_has_fresh_seeds(tmp_path: Path) -> None:
+    final = {"trials": 2, "final": {"trials": 1, "seeds": 2}}
+    driver = Driver(tmp_path, chain(final))
+    driver.play()
+    assert driver.controller.over
+    (best,) = driver.outcome()["ranking"]
+    assert len(best["scores"][0]) == 2
+    labels = [node.label for node in driver.sweep.plan.nodes if node.stage == "pretrain"]
+    assert len(labels) == 2 * (3 + 2)
+
+
+def test_another_source_is_another_study(tmp_path: Path) -> None:
+    """Otherwise its trials would keep the values of the old networks."""
+    contents = [
+        chain({"trials": 2}),
+        chain({"trials": 2}, steps=5000),
+        chain({"trials": 2}, task="FetchPush"),
+        chain({"trials": 2}, task="FetchPickAndPlace"),
+    ]
+    found = set()
+    for content in contents:
+        driver = Driver(tmp_path, content)
+        driver.play()
+        found.add(driver.outcome()["arms"][0]["study"])
+    assert len(found) == 4
+
+
 def recorded(folder: Path, content: Document) -> Driver:
     """The sweep as a later driver finds it, with the files of a driver that has ended."""
     driver = Driver(folder, content)
