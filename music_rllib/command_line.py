@@ -52,7 +52,9 @@ def called_as() -> list[str]:
 
 def how_to_continue() -> str:
     """The message of a stopped sweep: what is kept, and the command that continues it."""
-    command = shlex.join([*called_as(), *sys.argv[1:]])
+    from music_rllib.redaction import redact
+
+    command = redact(shlex.join([*called_as(), *sys.argv[1:]]))
     return f"Stopped. Finished runs and the last checkpoints are kept; continue with: {command}"
 
 

@@ -268,7 +268,8 @@ def _check_checkpoint(
     problems_before = len(findings.problems)
     for _, point in stage.examples():
         theirs = checkpoint.manifest.info.architecture
-        _check_fit(stage, point, made_for, theirs, str(checkpoint.folder), findings)
+        for run in point.runs.values():
+            _check_fit(stage, run, made_for, theirs, str(checkpoint.folder), findings)
     if len(findings.problems) > problems_before:
         return
     for needed in {handed_over(run) for point in stage.points for run in point.runs.values()}:
@@ -303,29 +304,31 @@ def _check_stage(stage: Stage, task: Task | None, above: Stage, findings: Findin
         searched = of_stage(values, above.name)
         with contextlib.suppress(ConfigError):  # invalid values are a problem of their own
             for source in [above.resolve(searched)] if searched else above.points:
-                for run in source.runs.values():
-                    origin = f"stage {above.name}"
-                    _check_fit(stage, point, run.task, run.architecture, origin, findings)
+                for own, run in point.runs.items():
+                    theirs = source.runs.get(task.name if task else own)
+                    if theirs is not None:  # a problem of its own, above
+                        origin = f"stage {above.name}"
+                        _check_fit(stage, run, theirs.task, theirs.architecture, origin, findings)
 
 
 def _check_fit(
     stage: Stage,
-    point: Point,
+    run: RunSettings,
     task: Task,
     architecture: Architecture,
     origin: str,
     findings: Findings,
 ) -> None:
-    """The architecture and the split must equal those of the source."""
+    """The architecture and the split of a run must equal those of its source."""
     starts_from = VARIANTS[stage.variant].starts_from
-    theirs = (len(task.agent_indices), len(task.surrounding_indices))
-    for run in point.runs.values():
-        for name in architecture.differences(run.architecture, starts_from):
-            findings.add((), f"needs the same {name} in stage {stage.name} as in {origin}")
-        ours = (len(run.task.agent_indices), len(run.task.surrounding_indices))
-        if starts_from == "estimator" and ours != theirs:
-            findings.add(
-                (),
-                f"needs as many agent and surrounding indices in {run.task.name} as in "
-                f"{task.name} ({origin}): {ours} and {theirs}",
-            )
+    for name in architecture.differences(run.architecture, starts_from):
+        findings.add((), f"needs the same {name} in stage {stage.name} as in {origin}")
+    ours, theirs = (
+        (len(one.agent_indices), len(one.surrounding_indices)) for one in (run.task, task)
+    )
+    if starts_from == "estimator" and ours != theirs:
+        findings.add(
+            (),
+            f"needs as many agent and surrounding indices in {run.task.name} as in {task.name} "
+            f"({origin}): {ours} and {theirs}",
+        )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 import time
 import unicodedata
 from pathlib import Path
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 from rich.table import Table
 from rich.text import Text
 
-from music_rllib.command_line import console_for
+from music_rllib.command_line import console_for, how_to_continue
 from music_rllib.program import main as sweep_main
 from music_rllib.redaction import (
     MAX_PARAM_LENGTH,
@@ -288,3 +289,14 @@ def test_a_password_in_the_tracking_uri_is_not_kept(tmp_path: Path) -> None:
     kept = [path for path in (tmp_path / "s").rglob("*") if path.is_file()]
     assert not [path for path in kept if b"planted" in path.read_bytes()]
     assert "http://localhost:1" in (tmp_path / "s" / "config.json").read_text()
+
+
+def test_the_command_that_continues_a_sweep_has_no_passwords(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    arguments = ["run", "my.yaml", "--storage", "s3://KEY:planted-1@bucket/x"]
+    server = "mlflow.tracking_uri=http://me:planted-2@host:5000"
+    monkeypatch.setattr(sys, "argv", ["music-rllib", *arguments, server])
+    said = how_to_continue()
+    assert "planted" not in said
+    assert said.endswith("run my.yaml --storage s3://bucket/x mlflow.tracking_uri=http://host:5000")

@@ -717,3 +717,23 @@ def test_settings_from_elsewhere_cannot_contradict_their_variant() -> None:
                 "music": variant_music("music-u", reach),
             }
         )
+
+
+def test_each_task_is_compared_with_its_own_source(
+    load: Callable[..., SweepConfig], problems: Callable[[Document], list[str]]
+) -> None:
+    """Tasks may have splits and estimators of different sizes."""
+    stages: list[Document] = [
+        {"name": "pretrain", "variant": "music-u"},
+        {"name": "finetune", "variant": "music-r", "init_from": "pretrain"},
+    ]
+    tasks = ["FetchPush", "PointCarry"]
+    load(changed(tasks=tasks, stages=stages))
+    own = {"PointCarry": {"music": {"hidden_size": 64}}}
+    both = [stage | {"per_task": own} for stage in stages]
+    load(changed(tasks=tasks, stages=both))
+    lines = problems(changed(tasks=tasks, stages=[both[0], stages[1]]))
+    assert ["needs the same music.hidden_size" in line for line in lines] == [True]
+    other = stages[1] | {"init_from": {"stage": "pretrain", "task": "FetchPush"}}
+    lines = problems(changed(tasks=tasks, stages=[stages[0], other]))
+    assert ["surrounding indices in PointCarry as in FetchPush" in one for one in lines] == [True]
