@@ -304,7 +304,7 @@ class RunSettings(StrictModel):
                 raise ValueError(f"music.{field} {rule}")
         if self.variant.startswith("intrinsic-") and self.intrinsic.reward is None:
             raise ValueError(f"intrinsic.reward must be given for {self.variant}, got null")
-        self.music.check_has_reward(self.intrinsic)
+        self.music.check_rewards(self.intrinsic)
         if self.intrinsic.frozen != (frozen := variant_intrinsic(self.variant)["frozen"]):
             rule = contradiction(self.variant, frozen, self.intrinsic.frozen)
             raise ValueError(f"intrinsic.frozen {rule}")

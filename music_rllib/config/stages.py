@@ -304,8 +304,8 @@ def _check_stage(stage: Stage, task: Task | None, above: Stage, findings: Findin
         searched = of_stage(values, above.name)
         with contextlib.suppress(ConfigError):  # invalid values are a problem of their own
             for source in [above.resolve(searched)] if searched else above.points:
-                for own, run in point.runs.items():
-                    theirs = source.runs.get(task.name if task else own)
+                for name, run in point.runs.items():
+                    theirs = source.runs.get(task.name if task else name)
                     if theirs is not None:  # a problem of its own, above
                         origin = f"stage {above.name}"
                         _check_fit(stage, run, theirs.task, theirs.architecture, origin, findings)

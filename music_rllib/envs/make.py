@@ -315,14 +315,15 @@ def augmentation_of(
     symmetries: Symmetries, used: Collection[Symmetry], layout: ReplayLayout, env: Env,
     *, reward: GoalReward | None = None, goals: bool = True, seed: int = 0,
 ) -> Augmentation:  # fmt: skip
-    """The task's symmetries for a replay, checked against `reward`; False if all `goals` are 0.
+    """The task's symmetries for a replay, checked against rewards; False if all `goals` are 0.
 
-    Resets `env` if rewards are checked.
+    Resets `env` if rewards are checked: `reward`, or the environment's `compute_reward`.
 
     Raises:
         ValueError: They do not fit the environment, or change rewards.
     """
     augmentation = Augmentation(symmetries, used, layout, goals=goals)
+    known, reward = reward, reward or compute_reward_of(env)
     if reward is None or not goals:
         return augmentation
     start = np.asarray(env.reset(seed=seed)[0]["achieved_goal"], np.float32)
@@ -331,7 +332,12 @@ def augmentation_of(
     inputs[:, :, layout.observation :] = start
     inputs[1, :, layout.observation :] += random_offsets(rows, layout.goal, 1e-3, 1.0)
     achieved, desired = inputs[:, :, layout.observation :]
-    rewards = reward(achieved, desired)
+    try:
+        rewards = reward(achieved, desired)
+    except Exception:
+        if known is None:  # without hindsight it need not be a function of goals
+            return augmentation
+        raise
     none = np.zeros(rows, np.float32)
     actions = np.zeros((rows, layout.action), np.float32)
     changed = Transitions(inputs[0], actions, none, none, inputs[1], None, np.arange(rows))

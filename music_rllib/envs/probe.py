@@ -243,6 +243,12 @@ class Probe:
 
     def _check_symmetries(self, env: Env, seed: int) -> None:
         symmetries = self._task.symmetries
+        parts = filter(None, (symmetries.mirror, *symmetries.translate))
+        if self._layout.goal and any(part.positions and not part.goal for part in parts):
+            self.remarks.append(
+                "symmetries change positions of the observation and no entry of the goal, which is "
+                "right only if the goal is in other coordinates; otherwise give `goal`, too"
+            )
         reward = self._reward if symmetries.kinds else None
         try:
             augmentation_of(

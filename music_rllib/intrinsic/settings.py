@@ -35,6 +35,8 @@ SETTINGS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     }
 )
 """Keyword arguments of these classes, which are numbers; reading them there would load PyTorch."""
+OF_GOALS = frozenset({"diayn", "discern"})
+"""Rewards that are constant if all goals are equal."""
 
 
 def _known_reward(name: str) -> str:
@@ -135,7 +137,12 @@ class MusicSettings(StrictModel):
             raise ValueError("prioritise_replay: true needs an estimator, got estimator: none")
         return self
 
-    def check_has_reward(self, intrinsic: IntrinsicSettings) -> None:
-        """Raise ValueError if there is neither the task's reward nor an intrinsic one."""
+    def check_rewards(self, intrinsic: IntrinsicSettings) -> None:
+        """Raise ValueError without any reward, and for a reward about goals that are all zeros."""
+        if self.goals == "zero" and intrinsic.reward in OF_GOALS:
+            raise ValueError(
+                f"goals: zero (music-u) leaves nothing to intrinsic.reward {intrinsic.reward}, "
+                "which is about goals; give it to other stages only"
+            )
         if not self.task_reward and self.estimator == "none" and intrinsic.reward is None:
             raise ValueError("task_reward: false without an estimator leaves no reward at all")

@@ -258,7 +258,7 @@ class TACConfigBase(AlgorithmConfig):
                 f"the zeros by achieved goals), got {replay.hindsight_k:g}"
             )
         try:
-            music.check_has_reward(intrinsic)
+            music.check_rewards(intrinsic)
         except ValueError as error:
             self._value_error(f"music_{error}")
         if problem := replay.problem(music, intrinsic):

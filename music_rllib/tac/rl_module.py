@@ -368,7 +368,9 @@ def states_by_module(
         module = ESTIMATOR_MODULE if network == ESTIMATOR_MODULE else DEFAULT_MODULE_ID
         prefix = "estimator" if network == ESTIMATOR_MODULE else network
         for name, array in arrays.items():
-            modules.setdefault(module, {})[f"{prefix}.{name}"] = array
+            # A tensor of the module itself, as a learned alpha, is named as its network.
+            key = name if name == network else f"{prefix}.{name}"
+            modules.setdefault(module, {})[key] = array
     return modules
 
 

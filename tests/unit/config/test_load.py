@@ -445,6 +445,10 @@ BAD: list[tuple[Document, str]] = [
         "replay.priority must be uniform with music.prioritise_replay, got td_error",
     ),
     (with_stage(1, music={"hidden_size": 64}), "needs the same music.hidden_size in stage finetu"),
+    (
+        with_stage(0, intrinsic={"reward": "discern"}),
+        "goals: zero (music-u) leaves nothing to intrinsic.reward discern",
+    ),
     (with_stage(1, music={"bound": "nwj"}), "needs the same music.bound in stage finetune as in"),
     (with_stage(0, intrinsic={"reward": "rdn"}), "intrinsic.reward must be displacement, random"),
     (with_stage(0, intrinsic={"reward": "a b:C"}), "or module:Class of your own, got 'a b:C'"),

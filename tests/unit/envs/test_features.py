@@ -129,6 +129,11 @@ def test_symmetries_that_change_rewards_are_refused() -> None:
 
     with pytest.raises(ValueError, match="must keep rewards: with FetchPush-v4, compute_reward di"):
         augmentation_of(declared, declared.kinds, layout, env, reward=absolute)
+    # Also without hindsight, which needs no other rewards.
+    wrong = Symmetries(mirror=Mirror(positions=(1,), goal=(1,), plane=0.0))
+    env.unwrapped.compute_reward = lambda achieved, desired, info: absolute(desired, achieved)  # type: ignore[attr-defined]
+    with pytest.raises(ValueError, match="must keep rewards: with FetchPush-v4, compute_reward di"):
+        augmentation_of(wrong, wrong.kinds, layout, env)
 
 
 @pytest.mark.parametrize("goals", ["environment", "zero"])

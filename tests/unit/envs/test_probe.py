@@ -109,6 +109,14 @@ def test_intrinsic_rewards_make_an_early_end_attractive(monkeypatch: pytest.Monk
     assert probed(monkeypatch, Sound, intrinsic=True).remarks == []
 
 
+def test_symmetries_without_the_goal_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = {"mirror": {"positions": [0], "goal": [0], "action": [0]}}
+    assert probed(monkeypatch, Sound, symmetries=whole).remarks == []
+    lacking = {"translate": [{"positions": [0], "distance": 0.1}]}
+    (remark,) = probed(monkeypatch, Sound, symmetries=lacking).remarks
+    assert "no entry of the goal" in remark
+
+
 def bonus(env: Sound, seen: Any, reward: float, *rest: Any) -> Any:
     return seen, reward + 10.0 * (reward == 0), *rest
 
