@@ -76,6 +76,8 @@ class TACConfigBase(AlgorithmConfig):
         # One iteration is one episode per sub-environment and the updates after it.
         self.min_time_s_per_iteration = None
         self.min_sample_timesteps_per_iteration = 1_000
+        # RLlib's default would evaluate sampled actions.
+        self.evaluation_config = {"explore": False}
         # The Learner checks for NaNs once per update call, with a message; not in every gradient.
         self.torch_skip_nan_gradients = True
         # TAC syncs weights itself; there are no connector states to sync.

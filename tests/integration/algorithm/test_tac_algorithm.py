@@ -601,6 +601,13 @@ def test_contradictory_settings_are_refused(make: Any, message: str) -> None:
         make(TACConfig().environment("Pendulum-v1")).validate()
 
 
+def test_evaluation_takes_the_mean_action_unless_asked_otherwise() -> None:
+    config = TACConfig().environment("Pendulum-v1").evaluation(evaluation_interval=1)
+    assert config.get_evaluation_config_object().explore is False
+    exploring = config.copy().evaluation(evaluation_config={"explore": True})
+    assert exploring.get_evaluation_config_object().explore is True
+
+
 def test_settings_are_validated_once_until_one_of_them_changes() -> None:
     config = TACConfig().environment("Pendulum-v1").training(entropic_index=1.5)
     config.validate()
