@@ -259,7 +259,8 @@ def lay_overrides(document: Document, overrides: Mapping[str, Any]) -> None:
         ConfigError: One names a stage that does not exist, or a setting that a grid or search
             varies.
     """
-    for key, value in overrides.items():
+    # Those of one stage are the last ones, in any order of the arguments.
+    for key, value in sorted(overrides.items(), key=lambda item: item[0].startswith("stages.")):
         place: KeyPath = tuple(key.split("."))
         if place[0] in LAYER_KEYS:
             for stage in _stages(document):

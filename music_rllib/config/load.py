@@ -58,9 +58,11 @@ def load_config(
     given = parse_overrides(overrides)
     if "preset" in given:
         document.put(("preset",), preset_path(given.pop("preset")))
-    if "preset" in document.data:
-        place = document.place(("preset",))
-        document.lay_over(read_preset(document.data.pop("preset"), Path(path).parent, place))
+    if "defaults" in given:  # replaces the file's, which lie above the preset
+        document.put(("defaults",), given.pop("defaults"))
+    place = document.place(("preset",))
+    if (preset := document.data.pop("preset", None)) is not None:
+        document.lay_over(read_preset(preset, Path(path).parent, place))
     lay_overrides(document, given)
     _list_seeds(document, findings)
     if isinstance(document.data.get("storage"), str):

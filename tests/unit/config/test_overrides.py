@@ -79,6 +79,23 @@ def test_a_preset_of_the_command_line_is_below_the_file(tmp_path: Path) -> None:
     assert (first.tac.tau, first.tac.gamma) == (0.05, 0.9)
 
 
+def test_new_defaults_keep_the_preset_which_null_switches_off(tmp_path: Path) -> None:
+    text = SWEEP.replace("seeds: 2", "preset: small")
+    first = runs(load(tmp_path, "defaults={env_steps: 5e4, tac: {lr: 0.01}}", text=text))[1]
+    # Of the preset, of the new defaults, and no longer of the file's.
+    assert (first.tac.tau, first.tac.lr, first.tac.gamma) == (0.05, 0.01, 0.95)
+    assert runs(load(tmp_path, "preset=null", text=text)) == runs(load(tmp_path))
+    assert runs(load(tmp_path, text=SWEEP.replace("seeds: 2", "preset: null"))) == runs(
+        load(tmp_path)
+    )
+
+
+def test_a_setting_of_one_stage_counts_in_any_order(tmp_path: Path) -> None:
+    arguments = "stages.first.tac.lr=0.01", "tac.lr=0.02"
+    for given in (arguments, arguments[::-1]):
+        assert [run.tac.lr for run in runs(load(tmp_path, *given))] == [0.01, 0.02, 0.02]
+
+
 SHARED = """
 name: mine
 tasks: [FetchReach]
