@@ -86,7 +86,7 @@ def _rule(error: yaml.YAMLError) -> str:
     return f"must be valid YAML: {getattr(error, 'problem', None) or error}"
 
 
-_QUOTED = re.compile(r"'[^']*'|\"[^\"]*\"|#.*")
+_QUOTED = re.compile(r"""'[^']*'|"(?:[^"\\]|\\.)*"|#.*""")
 _LIKE_A_SPACE = re.compile(r"[^\S \t\r\n]|[\u200b\u2060\ufeff]")
 _TAB_INDENTS = re.compile(r" *\t[ \t]*[^\s#]")
 

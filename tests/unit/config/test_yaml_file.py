@@ -68,6 +68,7 @@ def test_every_number_python_prints_is_read_back(
         ('{\n\t"a": {\n\t\t"b":\t"c",\n\t\t"d": [\n\t\t]\n\t}\n}\n', {"b": "c", "d": []}),
         ("a: x\ty\t\n  z\t# comment\n", "x y z"),
         ("a: 'x\u00a0y'  # and\u00a0here\n", "x\u00a0y"),
+        ('{"a": "say \\"x\u00a0y\\" c"}', 'say "x\u00a0y" c'),
     ],
 )
 def test_tabs_separate_tokens_and_quoted_text_keeps_any_space(
