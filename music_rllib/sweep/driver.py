@@ -35,6 +35,7 @@ from music_rllib.experiment.open_sweep import (
 )
 from music_rllib.experiment.plan import make_plan, remarks
 from music_rllib.experiment.sweep_files import ANALYSIS_PLAN, STATE
+from music_rllib.names import VARIABLE_STUDIES
 from music_rllib.redaction import redact
 from music_rllib.runtime.machine import (
     check_cpus,
@@ -216,8 +217,11 @@ def _with_environment(console: Console, config: SweepConfig) -> SweepConfig:
         return config
     how = "mlflow.tracking_uri=null keeps a sqlite file in the storage"
     _say(console, f"MLflow: {redact(uri)}, from {VARIABLE} ({how})")
-    mlflow = MlflowSettings(**given, tracking_uri=uri)
-    return replace(config, mlflow=mlflow, document={**config.document, "mlflow": vars(mlflow)})
+    config = replace(config, mlflow=MlflowSettings(**given, tracking_uri=uri))
+    # A task of a Slurm array has a file of its own, which `resume` must not use later.
+    if (own := os.environ.get(VARIABLE_STUDIES)) and own in uri:
+        return config
+    return replace(config, document={**config.document, "mlflow": vars(config.mlflow)})
 
 
 def _changes(opened: OpenSweep) -> Changes | None:

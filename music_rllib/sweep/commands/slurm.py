@@ -71,6 +71,8 @@ def slurm(
     """
     from music_rllib.sweep import driver
 
+    if any(one.startswith("resources.num_cpus=") for one in overrides or ()):
+        raise BadInputError("resources.num_cpus must not be given: --cpus sets it for each task")
     config = driver.load(file, overrides, storage=storage, name=name, seeds=seeds)
     if not _TIME.fullmatch(time):
         raise BadInputError(f"--time must be a time of Slurm such as 12:00:00 or 1-00, got {time}")

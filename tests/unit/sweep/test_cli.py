@@ -12,12 +12,14 @@ import pytest
 import torch
 import yaml
 
+from music_rllib.command_line import console_for
+from music_rllib.config.load import load_config
 from music_rllib.config.run_settings import RunSettings, variant_music
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.experiment.open_sweep import OpenSweep, open_sweep
 from music_rllib.program import main
 from music_rllib.store.handoff import write_handoff
-from music_rllib.sweep import execution
+from music_rllib.sweep import driver, execution
 from tests.hostile_files import SPACES
 
 Document = dict[str, Any]
@@ -116,6 +118,20 @@ def test_mlflows_own_variable_stands_in_for_an_absent_setting(
     result = program(document(), command="plan")
     assert result.exit_code == 2
     assert "MLFLOW_TRACKING_URI) must be null (an SQLite file" in result.stderr
+
+
+def test_the_mlflow_file_of_a_slurm_task_is_not_recorded(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """`resume` would log to a file that is deleted when the task ends."""
+    (tmp_path / "sweep.yaml").write_text(json.dumps(document()))
+    config = load_config(tmp_path / "sweep.yaml")
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", uri := f"sqlite:///{tmp_path}/own/mlflow.db")
+    seen = driver._with_environment(console_for(), config)
+    assert (seen.mlflow.tracking_uri, seen.document["mlflow"]["tracking_uri"]) == (uri, uri)
+    monkeypatch.setenv("MUSIC_RLLIB_STUDIES", f"{tmp_path}/own")
+    seen = driver._with_environment(console_for(), config)
+    assert (seen.mlflow.tracking_uri, seen.document.get("mlflow")) == (uri, None)
 
 
 BAD: list[tuple[Document, str]] = [

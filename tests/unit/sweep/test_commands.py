@@ -1026,6 +1026,8 @@ def test_slurm_writes_a_job_array_and_submits_it(
     refused = program(*command, "--submit")
     assert (refused.code, "no such partition" in refused.errors) == (2, True)
 
+    twice = program(*command, "resources.num_cpus=8")
+    assert (twice.code, "--cpus sets it for each task" in twice.errors) == (2, True)
     Path("smoke.slurm.sh").write_text("mine")
     refused = program(*command)
     assert (refused.code, "must not be a file of another origin" in refused.errors) == (2, True)
