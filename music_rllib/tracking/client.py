@@ -215,10 +215,13 @@ class Experiment:
             tags = child if node_key in node_keys else superseded
             wanted.append((run, tags if node_key else current))
         for run, tags in wanted:
-            if changed := dict(tags.items() - run.tags.items()):
-                self._mark(run, changed)
+            self.correct(run, tags)
 
-    def _mark(self, run: KnownRun, changed: Mapping[str, str]) -> None:
+    def correct(self, run: KnownRun, tags: Mapping[str, str]) -> None:
+        """Set those of the tags of an existing run that it has otherwise or not at all."""
+        changed = dict(tags.items() - run.tags.items())
+        if not changed:
+            return
         try:
             self.log(run.run_id, tags=changed)
         except MlflowException as error:

@@ -16,6 +16,7 @@ from itertools import islice, takewhile
 from typing import NamedTuple
 
 from mlflow.entities import Metric
+from mlflow.utils.mlflow_tags import MLFLOW_RUN_NAME
 
 from music_rllib import names
 from music_rllib.experiment.run_info import RunInfo
@@ -34,6 +35,12 @@ class StoredRun(NamedTuple):
     reports: Sequence[Report]
     read_policy: Callable[[], bytes | None] | None = None
     """Reads the policy; called after the histories of all runs were sent."""
+
+
+_PLACE = (
+    MLFLOW_RUN_NAME, names.TAG_LABEL, names.TAG_STAGE, names.TAG_TRIAL, names.TAG_PART,
+)  # fmt: skip
+"""Tags of a run's place in its sweep, which no result depends on."""
 
 
 class RunQueue:
@@ -194,6 +201,9 @@ class RunQueue:
         known = self._experiment.find(self.node_key, self._environment)
         if self._run is None and known is not None and known.is_complete:
             self._run, self._read_policy = known, None
+            # A stage may have another name since, and a trial another number.
+            tags = {**self._tags(), MLFLOW_RUN_NAME: self._info.name}
+            self._experiment.correct(known, {key: tags[key] for key in _PLACE if key in tags})
             return
         stored = read()
         self._read_policy = stored.read_policy

@@ -358,13 +358,16 @@ def test_a_reused_node_is_logged_once(storage: Path, tracker_on: MakeTracker) ->
     def read() -> StoredRun:
         raise AssertionError("MLflow has all of it")
 
-    again.mirror(run_info("old"), read)
+    # Its stage has another name now.
+    place = {names.TAG_STAGE: "renamed", names.TAG_TRIAL: 3}
+    again.mirror(run_info("old", name="renamed/old", tags=place), read)
     assert not again.close()
     assert again._experiment.known_id("old") == run_id
 
     client = client_of(storage)
     runs = runs_of(client)
-    old, new = runs["finetune/old"], runs["finetune/new"]
+    old, new = runs["renamed/old"], runs["finetune/new"]
+    assert (old.data.tags[names.TAG_STAGE], old.data.tags[names.TAG_TRIAL]) == ("renamed", "3")
     assert logged_steps(client, old) == STEPS
     assert (old.info.start_time, old.info.end_time) == (1_700_002_000_000, 1_700_020_000_000)
     assert new.data.tags[names.TAG_SOURCE_RUN] == old.info.run_id
