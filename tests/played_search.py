@@ -72,14 +72,18 @@ class Driver:
         seed: int = 0,
         *,
         leases: bool = False,
+        change: Callable[[OpenSweep], OpenSweep] = lambda sweep: sweep,
     ) -> None:
-        """With `leases`, another driver may compute the same sweep in turn."""
+        """With `leases`, another driver may compute the same sweep in turn.
+
+        `change` is called with the sweep before it begins.
+        """
         folder.mkdir(exist_ok=True)
         path = folder / "sweep.yaml"
         path.write_text(yaml.safe_dump(content, sort_keys=False))
         config = load_config(path, storage=str(folder / "results"))
         plan = make_plan(config)
-        self.sweep: OpenSweep = open_sweep(config, plan, config.storage)
+        self.sweep: OpenSweep = change(open_sweep(config, plan, config.storage))
         self.computed: list[str] = []
         self.pruned: dict[str, str] = {}
         self.controller = SearchController(
@@ -113,7 +117,7 @@ class Driver:
             suggestion = None
             if len(running) < slots:
                 suggestion = searcher.suggest("t")
-            if searcher.over and not running:
+            if searcher.over and not running and not isinstance(suggestion, dict):
                 return
             if isinstance(suggestion, dict):
                 node = scheduler.node(suggestion["key"])

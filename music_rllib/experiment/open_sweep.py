@@ -80,6 +80,8 @@ class OpenSweep:
     """Content of `plan.json` when the sweep was opened; empty if there was none."""
     earlier: list[dict[str, Any]] = field(default_factory=list)
     """Runs of earlier versions of the plan, as in `plan.json`."""
+    removed: frozenset[str] = frozenset()
+    """Keys of the nodes that were deleted to be trained again."""
 
     @cached_property
     def location(self) -> SweepLocation:
@@ -310,11 +312,8 @@ def _found_run(sweep: OpenSweep, node: Mapping[str, Any]) -> FoundRun | None:
 def changed_text(sweep: OpenSweep, runs: Iterable[FoundRun]) -> str | None:
     """A message with the changes of environments, the runs and the choices; None if no change."""
     groups: dict[tuple[str, tuple[str, ...]], list[FoundRun]] = {}
-    for run in runs:
-        if run.differences:
-            groups.setdefault((run.code, run.differences), []).append(run)
-    if not groups:
-        return None
+    for run in (run for run in runs if run.differences):
+        groups.setdefault((run.code, run.differences), []).append(run)
     lines = []
     for (task, changes), members in groups.items():
         more = f" and {len(changes) - SHOWN} more" if len(changes) > SHOWN else ""
@@ -324,7 +323,7 @@ def changed_text(sweep: OpenSweep, runs: Iterable[FoundRun]) -> str | None:
         )
         lines += [f"  {sweep.short(run.label)}: {run.progress}" for run in members[:SHOWN]]
         lines += [f"  ... and {len(members) - SHOWN} more"] * (len(members) > SHOWN)
-    return "\n".join((*lines, f"Choose: {ADVICE}."))
+    return "\n".join((*lines, f"Choose: {ADVICE}.")) if lines else None
 
 
 def decide(
@@ -345,7 +344,8 @@ def decide(
     """
     chosen = {run.key for run in runs if all_changed and run.differences}
     for name in retrain:
-        fits = {run.key for run in runs if label_matches(name, run.label)}
+        exact = {run.key for run in runs if name == run.label}
+        fits = exact or {run.key for run in runs if label_matches(name, run.label)}
         if not fits:
             known = ", ".join(run.label for run in runs[:SHOWN]) or "none"
             raise BadInputError(
@@ -353,9 +353,10 @@ def decide(
                 f"(there are: {known})"
             )
         chosen |= fits
-    for node in sweep.plan.nodes:  # every node comes after its input
-        if node.source_key in chosen:
-            chosen.add(node.key)
+    recorded = [(node["key"], node["input"]) for node in sweep.recorded.get("nodes", ())]
+    sources = dict([*recorded, *((node.key, node.source_key) for node in sweep.plan.nodes)])
+    while more := {key for key, source in sources.items() if source in chosen} - chosen:
+        chosen |= more
     again = [run for run in runs if run.key in chosen]
     changed = [run for run in runs if run.differences and run not in again]
     if not keep and (text := changed_text(sweep, changed)) is not None:
@@ -385,8 +386,9 @@ def remove_runs(
         sweep.store.work_folder(run.key).clear()
         if run.continuation is not None:
             sweep.store.continuation(run.continuation).clear()
-    finished = sweep.finished - {run.key for run in runs}
-    return replace(sweep, scheduler=Scheduler(sweep.plan, finished))
+    keys = {run.key for run in runs}
+    scheduler = Scheduler(sweep.plan, sweep.finished - keys)
+    return replace(sweep, scheduler=scheduler, removed=frozenset(keys | sweep.damaged.keys()))
 
 
 def accept_environments(

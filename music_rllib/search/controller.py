@@ -51,7 +51,7 @@ class SearchController(Listener):
         """
         self.searches = list(searches)
         self._scheduler, self._plan, self._store = sweep.scheduler, sweep.plan, sweep.store
-        self._environments = sweep.environments
+        self._environments, self._removed = sweep.environments, sweep.removed
         self._reused, self._pruned, self._say = reused, pruned, say
         self._reports: dict[str, dict[int, Report]] = {}
         """Reports of unfinished runs, by node key and environment step."""
@@ -157,6 +157,9 @@ class SearchController(Listener):
                     runs = self._plan_runs(search, study, trial, self._plan.seeds[: rung.seeds])
                 except ConfigError:
                     continue  # the reason why the trial failed
+                for run in runs if trial.state is TrialState.COMPLETE else ():
+                    if run.key in self._removed and not self._scheduler.knows(run.key):
+                        self._request(run, None)  # the trial keeps its score
                 for node in (node for run in runs for node in self._nodes_of(run)):
                     if not self._scheduler.knows(node.key):
                         finished = self._store.is_finished(node.key)

@@ -29,6 +29,7 @@ from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.search import FINAL_SEED
 from music_rllib.config.tac_settings import LearnedAlpha
 from music_rllib.experiment import sweep_files
+from music_rllib.experiment.open_sweep import OpenSweep, decide, found_runs, remove_runs
 from music_rllib.experiment.record import changes_since, keep_record
 from music_rllib.experiment.scheduler import Status
 from music_rllib.program import main
@@ -422,6 +423,36 @@ def answered(capsys: pytest.CaptureFixture[str], *arguments: str) -> Document:
     assert code == 0, errors
     found: Document = json.loads(output)
     return found
+
+
+def test_deleted_results_of_a_finished_search_are_trained_again(tmp_path: Path) -> None:
+    """With `--retrain`, and with them the runs that start from them."""
+    content = document({"trials": 2, "final": {"trials": 1, "seeds": 2}})
+    first = Driver(tmp_path, content)
+    first.play()
+    keep_record(first.sweep)
+
+    def retrained(name: str) -> set[str]:
+        said: list[str] = []
+
+        def remove(sweep: OpenSweep) -> OpenSweep:
+            runs = found_runs(sweep)
+            again, _ = decide(sweep, runs, [name], all_changed=False, keep=True)
+            return remove_runs(sweep, again, said.append)
+
+        driver = Driver(tmp_path, content, change=remove)
+        driver.play()
+        assert driver.trials() == first.trials()
+        assert driver.controller.over
+        computed = {key.partition("/")[0] for key in driver.computed}
+        assert len(computed) == len(driver.computed) == len(said)
+        return {driver.sweep.plan.node(key).label for key in computed}
+
+    trials = [node for node in first.sweep.plan.nodes if node.part == "trial0"]
+    assert len(retrained(trials[0].label)) == 1
+    of_seed = retrained("pretrain/FetchPush/seed0")
+    assert len(of_seed) == 1 + 2
+    assert len(retrained("pretrain")) == 3 + 2 + 2 * 3 + 2
 
 
 LOWEST: Document = {
