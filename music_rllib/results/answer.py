@@ -85,6 +85,8 @@ def planned_in_words(study: Study) -> str:
             text += f"; {count} already in version {number}"
         if study.late:
             text += f"; not planned, because runs of it had finished: {', '.join(study.late)}"
+        if study.dropped:
+            text += f"; dropped after results: {', '.join(study.dropped)}"
         changed = [] if latest is None else _changed(plan.plan, latest.plan)
         return f"{text}; changed afterwards: {', '.join(changed)}" if changed else text
     if latest is not None:

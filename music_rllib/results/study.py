@@ -70,6 +70,8 @@ class Study:
     """Other claims: late hypotheses, those that are only in `latest`, other pairs of the stage."""
     late: tuple[str, ...]
     """Hypotheses of `plan` about stages with a run that had finished before."""
+    dropped: tuple[str, ...]
+    """Hypotheses that an earlier version planned in time, and `plan` lacks since their results."""
     untested: tuple[str, ...]
     """Hypotheses that can't be tested, with the reason."""
     runs: tuple[int, ...]
@@ -155,6 +157,7 @@ def study_of(
         latest=latest,
         means=tuple(means),
         late=late,
+        dropped=_dropped(sweep, stages, plan) if plan else (),
         planned=decided(planned, planned=True, without_test=without_test),
         unplanned=(
             exploratory(unplanned)
@@ -188,8 +191,7 @@ def _plan_before_results(
     for number, version in reversed([*enumerate(sweep.plans)]):
         before, late = {}, []
         for text, of in version.plan.stages_of_hypotheses.items():
-            runs = (run for name in of & stages.keys() for run in stages[name].runs)
-            time, earlier = first_result(sweep, runs), sweep.plans[:number]
+            time, earlier = _first_result(sweep, stages, of), sweep.plans[:number]
             same = [one for one in earlier if version.plan.repeats(text, one.plan)]
             if version.recorded_ms < time:
                 continue
@@ -207,6 +209,23 @@ def _plan_before_results(
         if not found[2]:
             break
     return found
+
+
+def _first_result(sweep: Sweep, stages: Mapping[str, StageRuns], of: Collection[str]) -> float:
+    """Time in ms of the first result of some stages; infinite without one."""
+    return first_result(sweep, (run for name in of & stages.keys() for run in stages[name].runs))
+
+
+def _dropped(sweep: Sweep, stages: Mapping[str, StageRuns], plan: PlanVersion) -> tuple[str, ...]:
+    """Hypotheses that were planned in time, and left out of `plan` after their first result."""
+    found = {
+        text: None
+        for version in sweep.plans
+        for text, of in version.plan.stages_of_hypotheses.items()
+        if text not in plan.plan.hypotheses
+        and version.recorded_ms < _first_result(sweep, stages, of) <= plan.recorded_ms
+    }
+    return tuple(found)
 
 
 def _scopes(sweep: Sweep, tasks: Collection[str]) -> int:

@@ -279,7 +279,10 @@ def test_a_hypothesis_is_planned_by_the_first_version_that_has_it(
     assert planned(old, new, "q = 1.5 better than q = 1")[0] == [old, new]
     assert planned(old, new, margin=0.1)[0] == [old]
     assert planned(old, new, seeds="0, 1")[0] == [old]
-    assert planned(new)[0] == [new]
+    texts, said = planned(new)
+    assert texts == [new]
+    assert f"dropped after results: {old}" in said
+    assert "dropped" not in planned(old, new)[1]
 
 
 def test_settings_that_a_hypothesis_does_not_name_are_averaged(rng: np.random.Generator) -> None:
