@@ -36,6 +36,17 @@ _NEIGHBORS = 64
 _ROWS, _MOST_ROUNDED = 4096, 0.005
 """Number of goals tried for the effect of rounding, and the accepted share of changed rewards."""
 
+END_AT_GOAL = (
+    "step() terminates episodes; if it does so at the goal, hindsight needs compute_terminated("
+    "achieved_goal, desired_goal, info), or relabeled transitions do not end at their new goal"
+)
+EARLY_END = (
+    "step() terminates episodes, and intrinsic rewards lie in [-1, 0]: a policy earns more of them "
+    "by ending an episode early. If the end is a failure, use an environment that continues (often "
+    "env_kwargs: {terminate_when_unhealthy: false})"
+)
+"""Remarks about environments whose episodes terminate."""
+
 
 @dataclass(frozen=True)
 class Episode(Trajectory):

@@ -24,7 +24,7 @@ import numpy as np
 from gymnasium import spaces
 from pydantic import BaseModel
 
-from music_rllib.envs.episodes import Episode, Recording
+from music_rllib.envs.episodes import EARLY_END, END_AT_GOAL, Episode, Recording
 from music_rllib.envs.features import beyond_observation
 from music_rllib.envs.make import (
     Env,
@@ -62,13 +62,15 @@ _SIMILAR = 0.85
 
 
 class Question(BaseModel):
-    """A task, and what its runs use."""
+    """A task, and what its runs use.
+
+    That is the values of `replay.hindsight_episodes` of those with hindsight, and whether one has
+    MUSIC's or another intrinsic reward.
+    """
 
     task: Task
     hindsight: tuple[str, ...] = ()
-    """Values of `replay.hindsight_episodes` of the runs that use hindsight."""
     intrinsic: bool = False
-    """Whether a run has MUSIC's or another intrinsic reward."""
 
 
 class Request(BaseModel):
@@ -246,8 +248,8 @@ class Probe:
         parts = filter(None, (symmetries.mirror, *symmetries.translate))
         if self._layout.goal and any(part.positions and not part.goal for part in parts):
             self.remarks.append(
-                "symmetries change positions of the observation and no entry of the goal, which is "
-                "right only if the goal is in other coordinates; otherwise give `goal`, too"
+                "symmetries change positions and no entry of the goal: give `goal`, too, unless "
+                "the goal is in other coordinates"
             )
         reward = self._reward if symmetries.kinds else None
         try:
@@ -347,18 +349,9 @@ class Probe:
                     f"{known}){closest(key, self._keys)}; a step without it counts as not reached"
                 )
         if self._terminates and self._reward is not None and self._end is None:
-            self.remarks.append(
-                "step() terminates episodes; if it does so at the goal, hindsight needs "
-                "compute_terminated(achieved_goal, desired_goal, info), or relabeled transitions "
-                "do not end at their new goal"
-            )
+            self.remarks.append(END_AT_GOAL)
         if self._terminates and self._intrinsic:
-            self.remarks.append(
-                "step() terminates episodes, and intrinsic rewards lie in [-1, 0]: a policy earns "
-                "more of them by ending an episode early. If the end is a failure, use an "
-                "environment that continues (env_kwargs: {terminate_when_unhealthy: false} in many "
-                "of Gymnasium's)"
-            )
+            self.remarks.append(EARLY_END)
         self.remarks += (f"{line}; the networks get float32" for line in sorted(self._types))
         if unused := self._unused - {*GOAL_KEYS}:
             self.remarks.append(

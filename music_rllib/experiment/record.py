@@ -50,8 +50,15 @@ def keep_record(sweep: OpenSweep) -> None:
         sweep.earlier[:] = unchanged["earlier"] if unchanged else _earlier_runs(sweep)
     location.keep(CONFIG, configuration)
     keeps_trials = unchanged is not None and sweep.plan.searched and not sweep.plan.trials
-    if not keeps_trials:  # else the record has trials that the plan does not have yet
+    if unchanged is None or not keeps_trials:
         location.keep(PLAN, as_json(plan_document(sweep)))
+    elif sweep.removed:  # the record has trials that the plan does not have yet
+        location.keep(PLAN, as_json({**unchanged, **_retrained(sweep)}))
+
+
+def _retrained(sweep: OpenSweep) -> dict[str, list[str]]:
+    """The nodes to train again: a search that is stopped before must know them, too."""
+    return {"retrain": sorted(sweep.removed)} if sweep.removed else {}
 
 
 def plan_document(sweep: OpenSweep) -> dict[str, Any]:
@@ -62,6 +69,7 @@ def plan_document(sweep: OpenSweep) -> dict[str, Any]:
         "algorithm": sweep.plan.algorithm,
         "nodes": [plan_node(node) for node in sweep.plan.nodes],
         "trials": sweep.plan.trials,
+        **_retrained(sweep),
         "environments": {task: dict(found) for task, found in sweep.environments.now.items()},
         "earlier": [one for one in sweep.earlier if one["key"] not in keys],
     }

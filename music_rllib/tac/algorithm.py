@@ -168,7 +168,17 @@ class TAC(Algorithm):
         group.sync_weights(from_worker_or_learner_group=self.learner_group, inference_only=True)
 
     def evaluate(self, *args: Any, **kwargs: Any) -> Any:
-        """Evaluate as RLlib does, and pass the success rate to settings that follow it."""
+        """Evaluate as RLlib does, and pass the success rate to settings that follow it.
+
+        Raises:
+            ValueError: There are no evaluation runners; those of training would sample actions, and
+                play other episodes in training afterwards.
+        """
+        if self.eval_env_runner_group is None and not self.config.is_offline:
+            raise ValueError(
+                "evaluate() needs runners of its own: set evaluation(evaluation_interval=...) or "
+                "evaluation(evaluation_num_env_runners=...)"
+            )
         results = super().evaluate(*args, **kwargs)
         success = results.get(ENV_RUNNER_RESULTS, {}).get(SUCCESS_LAST)
         if success is not None:

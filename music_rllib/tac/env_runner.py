@@ -315,10 +315,10 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
         not_components: str | Collection[str] | None = None,
         **kwargs: Any,
     ) -> StateDict:
-        state: StateDict = {
-            "episodes_started": self._episodes_started,
-            "rng": self._rng.bit_generator.state,
-        }
+        state: StateDict = {}
+        if components is None:  # RLlib gives parts of a training runner to evaluation runners
+            state["episodes_started"] = self._episodes_started
+            state["rng"] = self._rng.bit_generator.state
         if self._check_component(COMPONENT_RL_MODULE, components, not_components):
             state[COMPONENT_RL_MODULE] = self.module.get_state(**kwargs)
             state[WEIGHTS_SEQ_NO] = self._weights_seq_no

@@ -250,10 +250,12 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
             self._check("critics", critics(pairs), settings.critic_count, rows, *quantiles)
             frozen = critics(pairs, frozen=True)
             self._check("critics", frozen, settings.critic_count, rows, *quantiles)
-        gradients = torch.autograd.grad(
-            frozen.sum(), [pairs, *critics.parameters()], allow_unused=True
-        )
-        if [each is not None for each in gradients] != [True, *[False] * (len(gradients) - 1)]:
+        trained = [each for each in critics.parameters() if each.requires_grad]
+        reached = [False]
+        if frozen.requires_grad:
+            found = torch.autograd.grad(frozen.sum(), [pairs, *trained], allow_unused=True)
+            reached = [each is not None for each in found]
+        if not reached[0] or any(reached[1:]):
             raise ValueError(
                 f"{type(self).__name__}.critics with frozen=True must give gradients to its inputs "
                 "and not to its parameters"

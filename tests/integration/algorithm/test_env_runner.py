@@ -204,6 +204,19 @@ def test_a_restored_runner_plays_the_same_episodes(behaviour: Any) -> None:
         np.testing.assert_array_equal(ours.actions, theirs.actions)
 
 
+def test_parts_of_a_runner_s_state_leave_other_runners_their_episodes() -> None:
+    """RLlib sends parts of the training runner's state to evaluation runners."""
+    training, evaluation = (
+        runner(Countdown, max_episode_steps=6, evaluation=here) for here in (False, True)
+    )
+    evaluation.sample()
+    before = evaluation.get_state()
+    evaluation.set_state(training.get_state(components=["rl_module", "env_to_module_connector"]))
+    after = evaluation.get_state()
+    for name in ("episodes_started", "rng"):
+        assert after[name] == before[name]
+
+
 def test_a_step_without_the_declared_success_key_has_no_success() -> None:
     made = runner(SaysSuccessAtTheEnd, num_envs=3, max_episode_steps=6, missing=False)
     episodes = made.sample(num_episodes=40)

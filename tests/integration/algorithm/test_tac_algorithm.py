@@ -343,6 +343,7 @@ def test_own_networks_act_learn_and_are_restored(tmp_path: Path) -> None:
     def own() -> TAC:
         config = TACConfig().environment("FetchReach-v4").training(**SMALL).debugging(seed=0)
         config.reporting(min_sample_timesteps_per_iteration=1)
+        config.evaluation(evaluation_interval=10**9, evaluation_duration=2)
         spec = RLModuleSpec(module_class=OwnNetworks, model_config={"width": 12})
         algo: TAC = config.rl_module(rl_module_spec=spec).build_algo()
         return algo
@@ -606,6 +607,9 @@ def test_evaluation_takes_the_mean_action_unless_asked_otherwise() -> None:
     assert config.get_evaluation_config_object().explore is False
     exploring = config.copy().evaluation(evaluation_config={"explore": True})
     assert exploring.get_evaluation_config_object().explore is True
+    algo = TACConfig().environment("Pendulum-v1").build_algo()
+    with pytest.raises(ValueError, match="set evaluation"):
+        algo.evaluate()
 
 
 def test_settings_are_validated_once_until_one_of_them_changes() -> None:

@@ -432,16 +432,22 @@ def test_deleted_results_of_a_finished_search_are_trained_again(tmp_path: Path) 
     first.play()
     keep_record(first.sweep)
 
-    def retrained(name: str) -> set[str]:
+    def retrained(name: str, stop_after: int | None = None) -> set[str]:
         said: list[str] = []
 
         def remove(sweep: OpenSweep) -> OpenSweep:
             runs = found_runs(sweep)
             again, _ = decide(sweep, runs, [name], all_changed=False, keep=True)
-            return remove_runs(sweep, again, said.append)
+            changed = remove_runs(sweep, again, said.append)
+            keep_record(changed)
+            return changed
 
         driver = Driver(tmp_path, content, change=remove)
-        driver.play()
+        driver.play(stop_after=stop_after)
+        if stop_after is not None:  # another driver continues
+            other = Driver(tmp_path, content)
+            other.play()
+            driver.computed += other.computed
         assert driver.trials() == first.trials()
         assert driver.controller.over
         computed = {key.partition("/")[0] for key in driver.computed}
@@ -450,7 +456,7 @@ def test_deleted_results_of_a_finished_search_are_trained_again(tmp_path: Path) 
 
     trials = [node for node in first.sweep.plan.nodes if node.part == "trial0"]
     assert len(retrained(trials[0].label)) == 1
-    of_seed = retrained("pretrain/FetchPush/seed0")
+    of_seed = retrained("pretrain/FetchPush/seed0", stop_after=1)
     assert len(of_seed) == 1 + 2
     assert len(retrained("pretrain")) == 3 + 2 + 2 * 3 + 2
 

@@ -9,7 +9,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from music_rllib.envs.episodes import Recording, first_mismatch, lost_by_rounding
-from music_rllib.envs.make import goal_end_of, goal_reward_of
+from music_rllib.envs.make import goal_end_of, goal_reward_of, make_env
 from music_rllib.envs.values import BadNumberError
 from music_rllib.replay.trajectories import ReplayLayout
 
@@ -253,22 +253,45 @@ def near_alone(achieved: Floats, desired: Floats) -> bool:
     return bool(np.linalg.norm(achieved - desired) < 0.05)  # of a batch: one bool
 
 
+def mixes_rows(achieved: Floats, desired: Floats) -> Any:
+    """Of a batch, the first row's achieved goal for all."""
+    return near(achieved[0] if achieved.ndim > 1 else achieved, desired)
+
+
 def near_one(achieved: Floats, desired: Floats) -> bool:
     return bool(np.hypot(*(achieved - desired)) < 0.05)  # raises for a batch
 
 
-@pytest.mark.parametrize("end", [near, near_alone, near_one])
+@pytest.mark.parametrize("end", [near, near_alone, near_one, mixes_rows])
 def test_the_end_at_a_goal_is_computed_for_each_row(end: Any) -> None:
     ends = goal_end_of(Ends(end))
     assert ends is not None
-    achieved = np.zeros((3, 2), np.float32)
-    desired = np.array([[0.0, 0.04], [0.0, 1.0], [0.01, 0.0]], np.float32)
+    achieved = np.array([[0.0, 0.0], [0.0, 0.0], [3.0, 0.0]], np.float32)
+    desired = np.array([[0.0, 0.04], [0.0, 1.0], [3.01, 0.0]], np.float32)
     assert ends(achieved, desired).tolist() == [True, False, True]
 
 
-def test_an_environment_that_never_ends_at_a_goal_has_no_function_for_it() -> None:
+def test_only_environments_that_are_known_to_never_end_have_no_function_for_it() -> None:
     assert goal_end_of(Reach(0.0)) is None
-    assert goal_end_of(Ends(lambda achieved, desired: False)) is None
+    assert goal_end_of(make_env("FetchPush-v4")) is None
+
+    def lifted(achieved: Floats, desired: Floats) -> Any:
+        return near(achieved, desired) & (achieved[..., 1] > 5)
+
+    ends = goal_end_of(Ends(lifted))
+    assert ends is not None
+    high = np.full((2, 2), 9.0, np.float32)
+    assert ends(high, high).tolist() == [True, True]
+
+
+def test_the_end_of_a_wrapper_counts() -> None:
+    class EndsAtGoal(gym.Wrapper[Any, Any, Any, Any]):
+        def compute_terminated(self, achieved: Floats, desired: Floats, info: Any) -> Any:
+            return near(achieved, desired)
+
+    ends = goal_end_of(EndsAtGoal(make_env("FetchPush-v4")))
+    assert ends is not None
+    assert ends(np.zeros((2, 3), np.float32), np.zeros((2, 3), np.float32)).all()
 
 
 @pytest.mark.parametrize(

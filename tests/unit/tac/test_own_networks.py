@@ -16,14 +16,16 @@ from music_rllib.tac.rl_module import TACModule
 class Stacked(nn.ModuleList):
     """Critics as a user may write them: `shape` is that of their outputs for B rows."""
 
-    def __init__(self, shape: str, *, honors_frozen: bool = True) -> None:
+    def __init__(self, shape: str, *, frozen: str = "detach") -> None:
         super().__init__(nn.Linear(7, 1) for _ in range(2))
-        self._shape, self._honors = shape, honors_frozen
+        self._shape, self._frozen = shape, frozen
 
     def forward(self, inputs: Tensor, *, frozen: bool = False) -> Tensor:
         weights: list[Tensor] = [each.get_parameter("weight") for each in self]
-        if frozen and self._honors:
+        if frozen and self._frozen != "ignored":
             weights = [each.detach() for each in weights]
+        if frozen and self._frozen == "no_grad":
+            inputs = inputs.detach()
         stacked = torch.stack([inputs @ each.T for each in weights])  # [C, B, 1]
         return {"C B": stacked.squeeze(-1), "C B 1": stacked, "B C": stacked[..., 0].T}[self._shape]
 
@@ -45,11 +47,8 @@ def made(name: str, network: Any, **settings: Any) -> TACModule:
     [
         ("critics", Stacked("C B 1"), r"critics must return the shape \[2, 3\] .* got \[2, 3, 1\]"),
         ("critics", Stacked("B C"), r"critics must return the shape \[2, 3\] .* got \[3, 2\]"),
-        (
-            "critics",
-            Stacked("C B", honors_frozen=False),
-            "critics with frozen=True must give",
-        ),
+        ("critics", Stacked("C B", frozen="ignored"), "critics with frozen=True must give"),
+        ("critics", Stacked("C B", frozen="no_grad"), "critics with frozen=True must give"),
         ("policy", nn.Linear(5, 2), r"policy must return the shape \[3, 4\] .* got \[3, 2\]"),
         ("value", nn.Linear(5, 2), r"value must return the shape \[3, 1\]"),
     ],
@@ -64,6 +63,7 @@ def test_networks_that_would_broadcast_are_refused(name: str, network: Any, mess
     ("name", "network", "settings"),
     [
         ("critics", Stacked("C B"), {}),
+        ("critics", Stacked("C B").requires_grad_(False), {}),
         ("policy", nn.Linear(5, 2), {"policy": "deterministic", "bootstrap": "critics",
                                      "alpha": 0.0, "behaviour": {"kind": "gaussian_noise"}}),
         ("critics", Critics(7, (4,), 3, layer_norm=True, quantiles=5),
