@@ -100,11 +100,16 @@ def _unchanged_plan(sweep: OpenSweep, configuration: str) -> dict[str, Any] | No
 
 
 def _earlier_runs(sweep: OpenSweep) -> list[dict[str, Any]]:
-    """The runs in `plan.json` that the plan does not have: `key` and `label` of each."""
+    """The runs in `plan.json` that the plan does not have; `clean` needs their `continuation`."""
     recorded = sweep.location.read(PLAN) or {"nodes": []}
     known = {one["key"]: one for one in (*recorded["nodes"], *recorded.get("earlier", ()))}
     gone = known.keys() - {node.key for node in sweep.plan.nodes}
-    return [{"key": key, "label": one["label"]} for key, one in known.items() if key in gone]
+    kept = ("key", "label", "continuation")
+    return [
+        {name: known[key][name] for name in kept if name in known[key]}
+        for key in known
+        if key in gone
+    ]
 
 
 def earlier_text(location: SweepLocation) -> str | None:

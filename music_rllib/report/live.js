@@ -3,7 +3,7 @@
 
 const asked = (path) => fetch(path, { cache: "no-store" });
 const PARTS = ["facts", "notes", "answer", "curves", "details", "groups", "searches", "origin"];
-let version = 0;
+let version = document.body.dataset.version;
 
 function time(seconds) {
   if (seconds === null || seconds === undefined) return "–";
@@ -87,8 +87,8 @@ async function look() {
     return;
   }
   showState(state);
-  if (version && state.version !== version) await renew();
-  version = state.version;
+  if (state.version && state.version !== version) await renew();
+  version = state.version ?? version;
 }
 
 document.title = `live: ${document.title}`;

@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import contextlib
 import json
+import secrets
 import shlex
 import socket
 import sys
 import threading
 import time
-from collections import deque
-from collections.abc import Callable
-from functools import cached_property
+from collections import defaultdict, deque
+from collections.abc import Callable, Mapping
+from functools import cached_property, partial
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
@@ -49,7 +50,8 @@ class Progress:
 
     def __init__(self, location: SweepLocation) -> None:
         self._location = location
-        self._seen: deque[tuple[float, int]] = deque()
+        self._seen: defaultdict[str, deque[tuple[float, int]]] = defaultdict(deque)
+        """Heartbeats and steps of each driver: several may write the state in turn."""
 
     def read(self) -> dict[str, Any]:
         """State, steps, speed, stages, running and failed runs of the sweep.
@@ -64,7 +66,7 @@ class Progress:
         left = steps["left"] + steps["to_come"]
         running = sweep_files.is_alive(state)
         outcome = driver["outcome"]
-        speed = self._speed(driver["heartbeat"], steps["done"]) if running else None
+        speed = self._speed(driver, steps["done"]) if running else None
         return {
             "sweep": self._location.name,
             "state": "interrupted" if outcome == "running" and not running else outcome,
@@ -107,11 +109,11 @@ class Progress:
         tasks = {*config["tasks"]}.union(*(stage.get("tasks") or () for stage in config["stages"]))
         return ShortLabels((stage["name"] for stage in config["stages"]), tasks)
 
-    def _speed(self, now: float, done: int) -> float | None:
-        """Environment steps per second of all runs; None before two different states."""
-        seen = self._seen
+    def _speed(self, driver: Mapping[str, Any], done: int) -> float | None:
+        """Environment steps per second of all runs; None before two states of this driver."""
+        now, seen = driver["heartbeat"], self._seen[f"{driver['machine']} {driver['pid']}"]
         if seen and (now < seen[-1][0] or done < seen[-1][1]):
-            seen.clear()  # another driver has taken over
+            seen.clear()  # the sweep was changed
         if not seen or now > seen[-1][0]:
             seen.append((now, done))
         while len(seen) > 2 and now - seen[0][0] > WINDOW:
@@ -130,11 +132,14 @@ class LivePage:
             ReportError: There is no sweep to report on.
         """
         self._make, self._progress = make, progress
-        self.html, self.version = make(), 1
+        self._pages, self._start, self.version = 0, secrets.token_hex(4), ""
         self._problem: str | None = None
         """The reason why the newest page could not be made."""
+        before = self.state().get("state")  # the sweep may end while the page is made
+        self._show(make())
         self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._follow, name="live page", daemon=True)
+        follow = partial(self._follow, before)
+        self._thread = threading.Thread(target=follow, name="live page", daemon=True)
         self._thread.start()
 
     def state(self) -> dict[str, Any]:
@@ -150,22 +155,29 @@ class LivePage:
         self._ended.set()
         self._thread.join(60.0)
 
-    def _follow(self) -> None:
-        took, before = 0.0, self.state().get("state")
+    def _show(self, html: str) -> None:
+        """Let `html` be the newest page; it contains its version, by which a tab tells it apart."""
+        self._pages += 1
+        self.version = f"{self._start}-{self._pages}"
+        self.plain = html
+        self.html = html.replace("<body", f'<body data-version="{self.version}"', 1)
+
+    def _follow(self, before: str | None) -> None:
+        took = 0.0
         while not self._ended.wait(max(LEAST_PAUSE, PAUSE_FACTOR * took)):
             now = self.state().get("state")
             if now != "running" and now == before:
                 continue
-            before, began = now, time.monotonic()
+            began = time.monotonic()
             try:
                 html = self._make()
             except Exception as error:  # the storage is busy or down: try again later
                 self._problem = f"The page is out of date: {for_people(first_line(error))}"
                 continue
-            self._problem = None
+            self._problem, before = None, now
             took = time.monotonic() - began
-            if html != self.html:
-                self.html, self.version = html, self.version + 1
+            if html != self.plain:
+                self._show(html)
 
 
 class Server(ThreadingHTTPServer):

@@ -528,6 +528,8 @@ def test_the_unit_of_a_node_starts_ray_with_known_options(tmp_path: Path) -> Non
     text = (CLUSTER / "ray-node.service").read_text()
     (program, action, *_) = re.findall("^ExecStart=(.*)$", text, re.MULTILINE)[0].split()
     assert (Path(program).name, action) == ("ray", start.name)
+    (path,) = re.findall("^Environment=PATH=(.*)$", text, re.MULTILINE)
+    assert path.split(":")[0] == str(Path(program).parent), "jobs start python"
     known = {name for option in start.params for name in option.opts}
     assert {*re.findall(r"(--[a-z-]+)[= ']", text)} - {"--now"} <= known
     if (verifier := shutil.which("systemd-analyze")) is not None:

@@ -153,6 +153,7 @@ class PrometheusListener(Listener):
         }
         nodes = [node for node in ray.nodes() if node["Alive"] and node["MetricsExportPort"]]
         targets = [f"{node['NodeManagerAddress']}:{node['MetricsExportPort']}" for node in nodes]
-        entry = {"labels": {"job": "music_rllib", "sweep_name": self._sweep}, "targets": targets}
+        # Equal labels: Prometheus scrapes an address once, however many sweeps name it.
+        entry = {"labels": {"job": "music_rllib"}, "targets": targets}
         self._targets.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(self._targets, json.dumps([entry], indent=1).encode())

@@ -73,6 +73,11 @@ def test_speed_and_time_left_are_measured_over_the_last_minutes(
     write_state(tmp_path, 200, now - 10, to_come=500)
     seen = progress.read()
     assert (seen["left"], seen["at_most"], seen["seconds_left"]) == (600, True, pytest.approx(60.0))
+    # Another driver, which counts other steps, writes the file in turn.
+    write_state(tmp_path, 150, now - 9, pid=2)
+    assert progress.read()["speed"] is None
+    write_state(tmp_path, 220, now - 8)
+    assert progress.read()["speed"] == pytest.approx(10.0)
     # A driver without a recent heartbeat is not running.
     write_state(tmp_path, 200, now - 1000)
     seen = progress.read()
@@ -170,8 +175,9 @@ def test_the_page_is_updated_while_the_sweep_runs(served: str) -> None:
         time.sleep(0.05)
 
 
+@pytest.mark.parametrize("outcome", ["running", "finished"])
 def test_a_page_that_fails_is_reported_and_made_later(
-    found: SweepLocation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    found: SweepLocation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, outcome: str
 ) -> None:
     """The thread that makes pages survives an error."""
     monkeypatch.setattr(live, "LEAST_PAUSE", 0.05)
@@ -180,6 +186,8 @@ def test_a_page_that_fails_is_reported_and_made_later(
 
     def make() -> str:
         answer = next(answers)
+        # The sweep ends while the first page is made.
+        write_state(tmp_path, 100, time.time(), outcome=outcome, ended=time.time())
         if isinstance(answer, Exception):
             raise answer
         return str(answer)
