@@ -118,8 +118,7 @@ def find_deletable(location: SweepLocation, *, unfinished: bool, everything: boo
                 work = WorkFolder(storage / "work" / key)
                 cleaning.leases[work.folder.path] = work.lease
                 cleaning.add(work.folder, f"checkpoints of {label}: {why}")
-        ended = key in finished or everything
-        if ended and (last := node.get("continuation")) in continued:
+        if key in finished and (last := node.get("continuation")) in continued:
             folder, what = storage / CONTINUATIONS / last, f"last checkpoint of {label}"
             if last in users:
                 cleaning.keep(folder.path, f"{what}: {', '.join(users[last])} has it too")

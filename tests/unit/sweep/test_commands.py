@@ -577,6 +577,21 @@ def test_clean_keeps_a_last_checkpoint_that_another_sweep_shares(
     assert not last.names()
 
 
+@IN_A_BUCKET
+def test_clean_all_leaves_no_last_checkpoint_of_a_shorter_run(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    """Nothing would list it when the sweep's own files are gone."""
+    sweep = played(storage, tmp_path)
+    node = sweep.plan.nodes[0]
+    last = sweep.store.continuation(continuation_key(node.run, node.source_key))
+    with last.new_checkpoint(4000) as new:
+        (new.folder / "x").touch()
+    opened(storage, tmp_path, defaults={"env_steps": 8000})
+    assert program("clean", f"{storage}/mine", "--all", "--yes").code == 0
+    assert not last.names()
+
+
 def from_handoff(storage: str, tmp_path: Path, name: str = "mine") -> OpenSweep:
     """A sweep of one run from a handoff in `tmp_path`, which has been copied into the storage."""
     folder = tmp_path / "given"
