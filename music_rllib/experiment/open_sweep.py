@@ -81,7 +81,7 @@ class OpenSweep:
     earlier: list[dict[str, Any]] = field(default_factory=list)
     """Runs of earlier versions of the plan, as in `plan.json`."""
     removed: frozenset[str] = frozenset()
-    """Keys of the nodes that were deleted to be trained again, in this run or an earlier one."""
+    """Keys of the nodes that were deleted and are not trained again yet."""
 
     @cached_property
     def location(self) -> SweepLocation:
@@ -170,7 +170,7 @@ def open_sweep(
             key: f"{labels[key]}: damaged, will be retrained: {why}" for key, why in damaged.items()
         },
         recorded=recorded,
-        removed=frozenset(recorded.get("retrain", ())),
+        removed=frozenset(recorded.get("retrain", ())) - published,
     )
 
 
@@ -387,9 +387,9 @@ def remove_runs(
         sweep.store.work_folder(run.key).clear()
         if run.continuation is not None:
             sweep.store.continuation(run.continuation).clear()
-    keys = {run.key for run in runs} | sweep.removed
+    keys = {run.key for run in runs}
     scheduler = Scheduler(sweep.plan, sweep.finished - keys)
-    return replace(sweep, scheduler=scheduler, removed=frozenset(keys | sweep.damaged.keys()))
+    return replace(sweep, scheduler=scheduler, removed=sweep.removed | keys | sweep.damaged.keys())
 
 
 def accept_environments(

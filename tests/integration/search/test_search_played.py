@@ -459,6 +459,10 @@ def test_deleted_results_of_a_finished_search_are_trained_again(tmp_path: Path) 
     of_seed = retrained("pretrain/FetchPush/seed0", stop_after=1)
     assert len(of_seed) == 1 + 2
     assert len(retrained("pretrain")) == 3 + 2 + 2 * 3 + 2
+    later = Driver(tmp_path, content, change=lambda sweep: remove_runs(sweep, [], print))
+    assert later.sweep.finished == {node.key for node in later.sweep.plan.nodes}
+    later.play()
+    assert later.computed == []
 
 
 LOWEST: Document = {
