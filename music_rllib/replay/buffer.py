@@ -196,7 +196,7 @@ class TrajectoryReplay(TrajectoryRing):
             goals = self._achieved(start[chosen], step[chosen], length[chosen])
             inputs[chosen, self.layout.observation :] = goals
             next_inputs[chosen, self.layout.observation :] = goals
-            rewards[chosen], discounts[chosen] = self._relabelled(both, chosen, goals)
+            self._relabel(both, chosen, goals, rewards, discounts)
         weights = None
         if self._td is not None:
             weights = self._td.importance_weights(row, len(self), importance_exponent)
@@ -220,20 +220,25 @@ class TrajectoryReplay(TrajectoryRing):
                 later = 1 + (self.rng.random(len(start)) * length).astype(np.int64)
         return self._read(start + later, self.layout.network_input, self.layout.goal)
 
-    def _relabelled(self, both: Floats, rows: Any, goals: Floats) -> tuple[NDArray[Any], Floats]:
-        """Rewards and discounts [B] of the stored steps `both[rows]` with new goals [B, G].
+    def _relabel(
+        self, both: Floats, rows: Any, goals: Floats, rewards: Floats, discounts: Floats
+    ) -> None:
+        """Change rewards and discounts of the stored steps `both[rows]` to new goals [B, G].
 
         A step that ended the episode for another reason than its goal ends it with any goal.
         """
         assert self._goal_reward is not None
         last, goal = self._steps.shape[1] - 1, self.layout.goal
-        achieved, ended = both[rows, -goal:], both[rows, last] > 0
-        if self._goal_end is not None:
-            if ended.any():
-                own = both[rows, -2 * goal : -goal]
-                ended[ended] = ~self._goal_end(achieved[ended], own[ended])
-            ended |= self._goal_end(achieved, goals)
-        return self._goal_reward(achieved, goals), 1.0 - ended.astype(np.float32)
+        achieved = both[rows, -goal:]
+        rewards[rows] = self._goal_reward(achieved, goals)
+        if self._goal_end is None:
+            return
+        ended = both[rows, last] > 0
+        if ended.any():
+            own = both[rows, -2 * goal : -goal]
+            ended[ended] = ~self._goal_end(achieved[ended], own[ended])
+        ended |= self._goal_end(achieved, goals)
+        discounts[rows] = 1.0 - ended.astype(np.float32)
 
     def _add_step(self, drawn: Transitions, ahead: int, rows: Rows, relabelled: Rows) -> None:
         """Extend the transitions `rows` by the step that is `ahead` of their first one."""
@@ -243,7 +248,7 @@ class TrajectoryReplay(TrajectoryRing):
         new = np.isin(rows, relabelled)
         if new.any():
             goals = drawn.inputs[rows[new], observation:]
-            rewards[new], discounts[new] = self._relabelled(both, new, goals)
+            self._relabel(both, new, goals, rewards, discounts)
         drawn.rewards[rows] += self._gamma**ahead * rewards
         drawn.discounts[rows] = self._gamma**ahead * discounts
         drawn.next_inputs[rows, :observation] = both[:, after : after + observation]
