@@ -105,11 +105,8 @@ def _earlier_runs(sweep: OpenSweep) -> list[dict[str, Any]]:
     known = {one["key"]: one for one in (*recorded["nodes"], *recorded.get("earlier", ()))}
     gone = known.keys() - {node.key for node in sweep.plan.nodes}
     kept = ("key", "label", "continuation")
-    return [
-        {name: known[key][name] for name in kept if name in known[key]}
-        for key in known
-        if key in gone
-    ]
+    earlier = (one for key, one in known.items() if key in gone)
+    return [{name: one[name] for name in kept if name in one} for one in earlier]
 
 
 def earlier_text(location: SweepLocation) -> str | None:

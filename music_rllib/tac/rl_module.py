@@ -243,17 +243,19 @@ class TACModule(TorchRLModule, InferenceOnlyAPI, TargetNetworkAPI):
         # In evaluation mode, batch normalization keeps its statistics.
         critics = copy.deepcopy(self.critics).eval()
         outputs = self.action_size if self.deterministic else 2 * self.action_size
-        with torch.random.fork_rng(devices=[]):  # a network may draw from it
+        # A network may draw from the generator; a user's module may have disabled gradients.
+        with torch.random.fork_rng(devices=[]), torch.enable_grad():
             self._check("policy", copy.deepcopy(self.policy).eval()(inputs), rows, outputs)
             if self._has_value:
                 self._check("value", copy.deepcopy(self.value).eval()(inputs), rows, 1)
             self._check("critics", critics(pairs), settings.critic_count, rows, *quantiles)
             frozen = critics(pairs, frozen=True)
             self._check("critics", frozen, settings.critic_count, rows, *quantiles)
+            total = frozen.sum()
         trained = [each for each in critics.parameters() if each.requires_grad]
         reached = [False]
-        if frozen.requires_grad:
-            found = torch.autograd.grad(frozen.sum(), [pairs, *trained], allow_unused=True)
+        if total.requires_grad:
+            found = torch.autograd.grad(total, [pairs, *trained], allow_unused=True)
             reached = [each is not None for each in found]
         if not reached[0] or any(reached[1:]):
             raise ValueError(

@@ -71,4 +71,5 @@ def test_networks_that_would_broadcast_are_refused(name: str, network: Any, mess
     ],
 )  # fmt: skip
 def test_other_networks_are_accepted(name: str, network: Any, settings: dict[str, Any]) -> None:
-    assert getattr(made(name, network, **settings), name) is network
+    with torch.no_grad():  # as if an environment's module had disabled gradients
+        assert getattr(made(name, network, **settings), name) is network
