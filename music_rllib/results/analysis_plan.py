@@ -99,15 +99,8 @@ class AnalysisPlan(_Strict):
     def hash(self) -> str:
         return content_key(self.model_dump(mode="json"))
 
-    def repeats(self, hypothesis: str, other: AnalysisPlan) -> bool:
-        """Whether `other` has the same comparison: also by the same metric, margin and seeds."""
-        stages = (plan.stages_of_hypotheses.get(hypothesis) for plan in (self, other))
-        tests = ((plan.stage, plan.metric, plan.margin, plan.seeds) for plan in (self, other))
-        return (
-            hypothesis in other.hypotheses
-            and len({*stages}) == len({*tests}) == 1
-            and other.budget.items() <= self.budget.items()
-        )
+    def has_same_test(self, other: AnalysisPlan) -> bool:
+        return (self.metric, self.margin) == (other.metric, other.margin)
 
     def is_part_of(self, other: AnalysisPlan) -> bool:
         """Whether this is `other`, possibly for a subset of its seeds."""
@@ -314,8 +307,9 @@ def record_plan(sweep: OpenSweep) -> tuple[Sequence[PlanVersion], tuple[str, ...
     sweep.location.keep(ANALYSIS_PLAN, as_json(as_document(versions)))
     sweep.location.keep(PLANS_TO_READ, as_markdown(sweep.config.name, versions))
     done = {node.stage for node in sweep.plan.nodes if node.key in sweep.finished}
+    known = [one.plan for one in before if plan.has_same_test(one.plan)]
     return versions, tuple(
         text
         for text, of in plan.stages_of_hypotheses.items()
-        if of & done and not any(plan.repeats(text, one.plan) for one in before)
+        if of & done and not any(one.stages_of_hypotheses.get(text) == of for one in known)
     )

@@ -11,8 +11,9 @@ import numpy as np
 from music_rllib import names
 from music_rllib.results.analysis_plan import AnalysisPlan, is_controlled
 from music_rllib.results.claims import FEWEST_SEEDS, Claim, Verdict
-from music_rllib.results.conditions import ALL_TASKS, Condition, StageRuns
+from music_rllib.results.conditions import ALL_TASKS, Condition
 from music_rllib.results.data import Sweep
+from music_rllib.results.scores import has_failed
 from music_rllib.results.statistics import (
     MAX_SEEDS,
     SIGNIFICANCE,
@@ -36,16 +37,8 @@ def answer(sweep: Sweep, study: Study) -> list[str]:
     sentences = [f"{planned[0].upper()}{planned[1:]}."]
     if study.question is not None:
         sentences = [f"Question: {study.question} ({planned})."]
-    if study.stage is None and any(run.status != "SCHEDULED" for run in sweep.runs):
-        return [*sentences, "No stage trains for the task: no comparison."]
-    if study.stage is None or not study.means:
-        if study.stage is not None and study.stage.is_search:
-            why = "trials are not compared on the seeds that select them"
-            return [*sentences, f"No run on fresh seeds has finished: {why}."]
-        return [*sentences, "No run that may be compared has finished yet."]
-    if not any(mean.scores.finished for mean in study.means):
-        failed = sum(mean.scores.failed for mean in study.means)
-        return [*sentences, f"No run has a result: {failed} failed."]
+    if not study.claims and (reason := _without_result(sweep, study)):
+        return [*sentences, reason]
     shown = [claim for claim in study.claims if claim.task == ALL_TASKS] or list(study.claims)
     sentences += [f"{claim_in_words(claim)}." for claim in shown[:MOST_CLAIMS]]
     if not shown and study.unplanned:
@@ -63,13 +56,27 @@ def answer(sweep: Sweep, study: Study) -> list[str]:
         verdicts = ", ".join(f"{n} {verdict}" for verdict, n in counts.items())
         sentences.append(f"Further comparisons: {verdicts}.")
     sentences += [_metric(study, shown), _seeds(sweep, study, shown)]
-    sentences.append(f"Control: {_control(sweep, study, study.stage)}.")
+    sentences.append(f"Control: {_control(sweep, study)}.")
     undecided = (Verdict.UNDECIDED, Verdict.NONE)
     if any(claim.verdict in undecided and not claim.unfinished for claim in study.claims):
         alike = _alike(shown)
         means = [one for one in study.means if _is_alike(one, alike)]
         sentences += filter(None, [power_in_words(alike, means, study.family)])
     return [*sentences, *(f"Not tested: {text}." for text in study.untested[:1])]
+
+
+def _without_result(sweep: Sweep, study: Study) -> str | None:
+    """Why there is nothing to compare; None if a run has a result."""
+    if study.stage is None and any(run.status != "SCHEDULED" for run in sweep.runs):
+        return "No stage trains for the task: no comparison."
+    if any(mean.scores.finished for mean in study.means):
+        return None
+    if study.runs and all(sweep.runs[run].status in ("FINISHED", "FAILED") for run in study.runs):
+        return f"No run has a result: {len(study.runs)} failed or diverged."
+    if study.stage is not None and study.stage.is_search:
+        why = "trials are not compared on the seeds that select them"
+        return f"No run on fresh seeds has finished: {why}."
+    return "No run that may be compared has finished yet."
 
 
 def planned_in_words(study: Study) -> str:
@@ -81,7 +88,7 @@ def planned_in_words(study: Study) -> str:
             f"planned {plan.recorded}, before {first} finished; version {plan.version}, "
             f"hash {plan.hash[:12]}"
         )
-        for number, count in Counter(one.version for one in study.before.values()).items():
+        for number, count in Counter(one.version for one in study.before).items():
             text += f"; {count} already in version {number}"
         if study.late:
             text += f"; not planned, because runs of it had finished: {', '.join(study.late)}"
@@ -180,7 +187,8 @@ def _alike(shown: Sequence[Claim]) -> list[Claim]:
 
 def _seeds(sweep: Sweep, study: Study, shown: Sequence[Claim]) -> str:
     finished = sum(sweep.runs[run].is_finished for run in study.runs)
-    failed = sum(mean.scores.failed for mean in study.means)
+    metrics = {mean.task: mean.measure.metric for mean in study.means}
+    failed = sum(has_failed(sweep, run, metrics.get(sweep.runs[run].task)) for run in study.runs)
     counts = sorted({n for one in shown for n in one.contrast.seeds})
     if not counts:
         counts = sorted({len(one.scores.by_seed) for one in study.means})
@@ -199,11 +207,11 @@ def _seeds(sweep: Sweep, study: Study, shown: Sequence[Claim]) -> str:
     return text
 
 
-def _control(sweep: Sweep, study: Study, stage: StageRuns) -> str:
+def _control(sweep: Sweep, study: Study) -> str:
     """What is held equal so that different q can be compared."""
-    version = study.plan or study.latest
-    if version is not None:
-        return version.plan.control
+    version, stage = study.plan or study.latest, study.stage
+    if version is not None or stage is None:
+        return version.plan.control if version else "none"
     alphas = {
         (one.entropic_index, sweep.runs[one.runs[0]].tags.get(names.TAG_ALPHA, ""))
         for one in stage.compared
@@ -229,6 +237,8 @@ def power_in_words(claims: Sequence[Claim], means: Sequence[Mean], family: int) 
     margin = max((claim.margin for claim in claims if claim.margin is not None), default=None)
     if margin is None:
         return None
+    compared = {one.runs for claim in claims for pair in claim.pairs for one in pair}
+    means = [mean for mean in means if mean.condition.runs in compared]
     if means and all(_at_a_bound(mean, margin) for mean in means):
         return (
             f"All conditions are within {margin:g} of a bound, where seeds differ less than "

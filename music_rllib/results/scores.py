@@ -105,14 +105,21 @@ def measure_on(
         horizon=min(horizon, sweep.least_budget(task, own)),
         maximised=maximised,
     )
-    if not any(_has_failed(sweep, run, measure.metric) for run in own):
+    if not any(has_failed(sweep, run, measure.metric) for run in own):
         return measure
     return replace(measure, worst=_worst(sweep, own, measure))
 
 
-def _has_failed(sweep: Sweep, run: int, metric: str) -> bool:
-    """Whether a run ended with an error, or diverged to a score that is not a number."""
-    record, values = sweep.runs[run], sweep.column(run, metric).value
+def has_failed(sweep: Sweep, run: int, metric: str | None = None) -> bool:
+    """Whether a run ended with an error, or diverged to a score that is not a number.
+
+    Args:
+        sweep: The runs.
+        run: Position of the run.
+        metric: Metric of the score; None: the primary one.
+    """
+    record = sweep.runs[run]
+    values = sweep.column(run, metric or sweep.primary_metric(record.task)).value
     diverged = record.is_finished and len(values) > 0 and not np.isfinite(values[-1])
     return record.status == "FAILED" or diverged
 
@@ -133,7 +140,7 @@ def _worst(sweep: Sweep, runs: Sequence[int], measure: Measure) -> float:
 
 def _score(sweep: Sweep, run: int, measure: Measure) -> float:
     """The score of a run; NaN if it is unfinished or was not evaluated up to the horizon."""
-    if not sweep.runs[run].is_finished or _has_failed(sweep, run, measure.metric):
+    if not sweep.runs[run].is_finished or has_failed(sweep, run, measure.metric):
         return np.nan
     steps, values = sweep.finite(run, measure.metric)
     if measure.kind != "final" and measure.horizon > 0:
@@ -148,7 +155,7 @@ def scores_of(sweep: Sweep, condition: Condition, task: str, measure: Measure) -
     fail. An unfinished run has no score.
     """
     runs = [run for run in condition.runs if sweep.runs[run].task == task]
-    failed = {run for run in runs if _has_failed(sweep, run, measure.metric)}
+    failed = {run for run in runs if has_failed(sweep, run, measure.metric)}
     scores = {run: measure.worst if run in failed else _score(sweep, run, measure) for run in runs}
     known = {run: score for run, score in scores.items() if np.isfinite(score)}
     evaluated = [_evaluations(sweep, run, measure) for run in known if run not in failed]

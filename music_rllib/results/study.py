@@ -8,7 +8,7 @@ and an unadjusted p-value.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import combinations
@@ -58,20 +58,19 @@ class Study:
     stage: StageRuns | None
     """None before a run has started, and without a stage that trains for the task."""
     plan: PlanVersion | None
-    """The last version recorded before the first run of its hypotheses, or of some of them, had
-    finished; None without one."""
-    before: Mapping[str, PlanVersion]
-    """Hypotheses of `plan` that an earlier version planned in time, and `plan` no longer."""
+    """The last version that planned a hypothesis in time; None without one."""
+    before: tuple[PlanVersion, ...]
+    """For each hypothesis that an earlier version planned in time: this version."""
     latest: PlanVersion | None
     means: tuple[Mean, ...]
     planned: tuple[Claim, ...]
-    """Claims of the hypotheses of `plan`, without the `late` ones."""
+    """Claims of the hypotheses that were planned in time."""
     unplanned: tuple[Claim, ...]
-    """Other claims: late hypotheses, those that are only in `latest`, other pairs of the stage."""
+    """Other claims: late hypotheses, planned ones with a later metric or margin, other pairs."""
     late: tuple[str, ...]
-    """Hypotheses of `plan` about stages with a run that had finished before."""
+    """Hypotheses of `latest` that were not planned in time."""
     dropped: tuple[str, ...]
-    """Hypotheses that an earlier version planned in time, and `plan` lacks since their results."""
+    """Hypotheses that were planned in time, and that `latest` lacks since their results."""
     untested: tuple[str, ...]
     """Hypotheses that can't be tested, with the reason."""
     runs: tuple[int, ...]
@@ -110,7 +109,8 @@ def study_of(
     """
     stages = {found.name: found for found in find_stages(sweep)}
     latest = sweep.plans[-1] if sweep.plans else None
-    plan, before, late = _plan_before_results(sweep, stages)
+    in_time = _planned_in_time(sweep, stages)
+    plan = max(in_time.values(), key=lambda one: one.recorded_ms, default=None)
     chosen = stages.get(stage or (latest.plan.stage if latest else ""))
     if chosen is None and stage is None:
         chosen = next((s for s in reversed(stages.values()) if s.has_task_reward), None)
@@ -119,18 +119,25 @@ def study_of(
         of_hypotheses = [found for name, found in stages.items() if name in latest.plan.stages]
         chosen = stages_together(of_hypotheses) or chosen
     untested: dict[str, int] = {}
-    planned = list(_of_plan(sweep, stages, plan, late, untested)) if plan else []
+    planned: list[Claim] = []
+    for version in sweep.plans:
+        own = [key for key, planned_by in in_time.items() if planned_by is version]
+        planned += _of_plan(sweep, stages, version, own, untested)
     without_test = sum(untested.values())
     unplanned: list[Claim] = []
-    if plan is not None and late:
-        in_time = [text for text in plan.plan.hypotheses if text not in late]
-        why = "exploratory: runs of it had finished before the plan"
-        others = _of_plan(sweep, stages, plan, in_time, untested)
-        unplanned += [replace(claim, why=why) for claim in others]
-    if latest is not None and latest != plan:
-        tests = {(one.plan.metric, one.plan.margin) for one in (plan, latest) if one}
-        known = plan.plan.hypotheses if plan and len(tests) == 1 else ()
-        unplanned += _of_plan(sweep, stages, latest, known, untested)
+    late: list[_Key] = []
+    if latest is not None:
+        keys = latest.plan.stages_of_hypotheses.items()
+        late = [key for key in keys if key not in in_time]
+        again = [
+            key
+            for key in keys
+            if key in in_time and not latest.plan.has_same_test(in_time[key].plan)
+        ]
+        why = "exploratory: runs of it had finished before the plan" if plan else ""
+        of_late = _of_plan(sweep, stages, latest, late, untested)
+        unplanned += [replace(claim, why=why) for claim in of_late]
+        unplanned += _of_plan(sweep, stages, latest, again, untested)
     means: list[Mean] = []
     if chosen is not None:
         kind, margin = "auc", None
@@ -147,17 +154,22 @@ def study_of(
         of_stage = list(claims_of(counted_sweep, labelled, measures, margin))
         unplanned += [claim for claim in of_stage if claim.subject not in known_subjects]
         if plan is None:
-            without_test = len(pairs) * _scopes(sweep, chosen.tasks) - len(of_stage)
-    of_plan = [stages[name] for name in (plan.plan.stages if plan else ()) if name in stages]
+            rates = {measure.metric for measure in measures.values()}
+            without_test = len(pairs) * _scopes(chosen.tasks, rates) - len(of_stage)
+    of_plan = [one for name, one in stages.items() if any(name in of for _, of in in_time)]
     compared = [run for one in filter(None, [chosen, *of_plan]) for run in _runs(one)]
     return Study(
         stage=chosen,
         plan=plan,
-        before=before,
+        before=tuple(one for one in in_time.values() if one is not plan),
         latest=latest,
         means=tuple(means),
-        late=late,
-        dropped=_dropped(sweep, stages, plan) if plan else (),
+        late=tuple(text for text, _ in late),
+        dropped=tuple(
+            text
+            for text, of in in_time
+            if latest is not None and (text, of) not in latest.plan.stages_of_hypotheses.items()
+        ),
         planned=decided(planned, planned=True, without_test=without_test),
         unplanned=(
             exploratory(unplanned)
@@ -175,84 +187,49 @@ def _runs(stage: StageRuns) -> list[int]:
     return [run for condition in stage.compared for run in condition.runs]
 
 
-def _plan_before_results(
-    sweep: Sweep, stages: Mapping[str, StageRuns]
-) -> tuple[PlanVersion | None, dict[str, PlanVersion], tuple[str, ...]]:
-    """The last version of the plan that was recorded before results.
+_Key = tuple[str, frozenset[str]]
+"""A hypothesis, and the stages that it compares."""
 
-    A hypothesis is late if a run of its stages had finished, as one that an earlier sweep trained,
-    unless an earlier version had planned the same comparison in time. A version without late
-    hypotheses comes before a later one with some, unless that one repeats all of its hypotheses.
 
-    Returns:
-        The version, its hypotheses that only earlier versions planned in time, and its late ones.
+def _planned_in_time(sweep: Sweep, stages: Mapping[str, StageRuns]) -> dict[_Key, PlanVersion]:
+    """The hypotheses that were planned, with the version by which they are tested.
+
+    This is the last version that was recorded before the first result of the hypothesis's stages. A
+    hypothesis that it lacks was withdrawn in time, or came too late.
     """
-    found: tuple[PlanVersion | None, dict[str, PlanVersion], tuple[str, ...]] = (None, {}, ())
-    for number, version in reversed([*enumerate(sweep.plans)]):
-        before, late = {}, []
-        for text, of in version.plan.stages_of_hypotheses.items():
-            time, earlier = _first_result(sweep, stages, of), sweep.plans[:number]
-            same = [one for one in earlier if version.plan.repeats(text, one.plan)]
-            if version.recorded_ms < time:
-                continue
-            if same and same[0].recorded_ms < time:
-                before[text] = same[0]
-            else:
-                late.append(text)
-        if len(before) + len(late) == len(version.plan.hypotheses):
-            continue
-        later = found[0]
-        if later is None or not (
-            late or all(later.plan.repeats(text, version.plan) for text in version.plan.hypotheses)
-        ):
-            found = version, before, tuple(late)
-        if not found[2]:
-            break
+    found: dict[_Key, PlanVersion] = {}
+    every = (key for one in sweep.plans for key in one.plan.stages_of_hypotheses.items())
+    for text, of in dict.fromkeys(every):
+        runs = (run for name in of & stages.keys() for run in stages[name].runs)
+        time = first_result(sweep, runs)
+        before = [version for version in sweep.plans if version.recorded_ms < time]
+        if before and before[-1].plan.stages_of_hypotheses.get(text) == of:
+            found[text, of] = before[-1]
     return found
 
 
-def _first_result(sweep: Sweep, stages: Mapping[str, StageRuns], of: Collection[str]) -> float:
-    """Time in ms of the first result of some stages; infinite without one."""
-    return first_result(sweep, (run for name in of & stages.keys() for run in stages[name].runs))
-
-
-def _dropped(sweep: Sweep, stages: Mapping[str, StageRuns], plan: PlanVersion) -> tuple[str, ...]:
-    """Hypotheses that were planned in time, and left out of `plan` after their first result."""
-    found = {
-        text: None
-        for version in sweep.plans
-        for text, of in version.plan.stages_of_hypotheses.items()
-        if text not in plan.plan.hypotheses
-        and version.recorded_ms < _first_result(sweep, stages, of) <= plan.recorded_ms
-    }
-    return tuple(found)
-
-
-def _scopes(sweep: Sweep, tasks: Collection[str]) -> int:
+def _scopes(tasks: Collection[str], metrics: Collection[str]) -> int:
     """Number of comparisons of two conditions: on each task, and on all if they have rates."""
-    rates = {sweep.primary_metric(run.task) for run in sweep.runs if run.task in tasks}
-    return len(tasks) + (len(tasks) > 1 and rates <= names.EVAL_RATES)
+    return len(tasks) + (len(tasks) > 1 and names.EVAL_RATES.issuperset(metrics))
 
 
 def _of_plan(
     sweep: Sweep,
     stages: Mapping[str, StageRuns],
     version: PlanVersion,
-    known: Sequence[str],
+    hypotheses: Sequence[_Key],
     untested: dict[str, int],
 ) -> Iterator[Claim]:
-    """The undecided claims of a plan's hypotheses without the `known` ones.
+    """The undecided claims of some of a plan's hypotheses.
 
     Fills `untested` with reasons and the number of comparisons that can't be tested.
     """
-    plan, with_runs = version.plan, {run.task for run in sweep.runs}
-    sweep = counted(sweep, plan.metric)
-    for text, of in plan.stages_of_hypotheses.items():
-        if text in known:
-            continue
+    plan = version.plan
+    sweep = counted(sweep, plan.metric) if hypotheses else sweep
+    for text, of in hypotheses:
         hypothesis = Hypothesis.of(text)
-        tasks = {run.task for run in sweep.runs if run.stage in of} | plan.budget.keys() - with_runs
-        scopes = _scopes(sweep, tasks)
+        tasks = _tasks_of_all(sweep, of, plan.budget.keys())
+        scopes = _scopes(tasks, {sweep.primary_metric(task) for task in tasks})
         sides = (hypothesis.first, hypothesis.second)
         first, second = (_matching(sweep, stages, side, plan.stage) for side in sides)
         pairs = _equal_in_the_rest(first, second, hypothesis)
@@ -272,6 +249,13 @@ def _of_plan(
             reason = "no seed has finished in both conditions"
             untested[f"{text}{where}: {reason}"] = scopes - len(claims)
         yield from (replace(claim, hypothesis=hypothesis) for claim in claims)
+
+
+def _tasks_of_all(sweep: Sweep, stages: Collection[str], planned: Set[str]) -> set[str]:
+    """The tasks that all stages have, or will have: runs that have not begun may be unknown."""
+    unknown = planned - {run.task for run in sweep.runs}
+    known = [{run.task for run in sweep.runs if run.stage == stage} for stage in stages]
+    return set.intersection(*((tasks or planned) | unknown for tasks in known))
 
 
 def _pairs(conditions: Sequence[Condition]) -> list[tuple[Condition, Condition]]:

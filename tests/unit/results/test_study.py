@@ -276,13 +276,58 @@ def test_a_hypothesis_is_planned_by_the_first_version_that_has_it(
     assert "before the first run of each new hypothesis finished; version 2" in said
     assert "1 already in version 1" in said
     # A hypothesis about the finished stage, or another test of it, comes too late.
-    assert planned(old, new, "q = 1.5 better than q = 1")[0] == [old, new]
-    assert planned(old, new, margin=0.1)[0] == [old]
-    assert planned(old, new, seeds="0, 1")[0] == [old]
+    texts, said = planned(old, new, "q = 1.5 better than q = 1")
+    assert (texts, "q = 1.5 better than q = 1" in said) == ([old, new], True)
+    texts, said = planned(old, new, margin=0.1)
+    assert texts == [old, new]
+    assert planned(old, new, seeds="0, 1")[0] == [old, new]
+    # A hypothesis that is left out after its result is still tested.
     texts, said = planned(new)
-    assert texts == [new]
+    assert texts == [old, new]
     assert f"dropped after results: {old}" in said
     assert "dropped" not in planned(old, new)[1]
+
+
+def test_a_plan_grows_by_a_stage_that_becomes_the_default(rng: np.random.Generator) -> None:
+    """Without `analysis.stage` a hypothesis is about the last stage."""
+    train = study({"1": 0.2, "1.5": 0.4}, 8, rng)
+    of_train = "stage = train, q = 1.5 against stage = train, q = 1"
+    of_tune = "q = 1.5 against q = 1"
+    first = with_plan((), plan(of_tune), DONE - 1)
+    both = with_plan(first, plan(of_tune, stage="tune", seeds="train: 0, 1; tune: 8"), DONE + 1)
+    found = study_of(sweep_of(train, both))
+    (claim,) = found.planned
+    assert (claim.verdict, found.dropped) == (Verdict.SUPERIOR, (of_tune,))
+    # Also if both name their stages, and if nothing of the new stage has a result.
+    first = with_plan((), plan(of_train), DONE - 1)
+    grown = with_plan(first, plan(of_train, of_tune, stage="tune"), DONE + 1)
+    waiting = replace(train[0][0], status="SCHEDULED")
+    waiting = replace(waiting, tags={**waiting.tags, names.TAG_STAGE: "tune"})
+    for runs in (train, [*train, (waiting, Points())]):
+        sweep = sweep_of(runs, grown)
+        found = study_of(sweep)
+        assert [one.verdict for one in found.planned] == [Verdict.SUPERIOR]
+        assert (found.family, found.late, found.dropped) == (2, (), ())
+        assert "superior" in answer(sweep, found)[1]
+
+
+def test_a_late_hypothesis_does_not_make_others_of_its_version_late(
+    rng: np.random.Generator,
+) -> None:
+    train = study({"1": 0.2, "1.5": 0.4}, 8, rng)
+    old, late = "q = 1.5 against q = 1", "q = 1.5 better than q = 1"
+    new = "stage = tune, q = 1.5 against stage = tune, q = 1"
+    versions = with_plan((), plan(old), DONE - 1)
+    versions = with_plan(versions, plan(late, new), DONE + 1)
+    tune = [
+        run({"tac.entropic_index": q}, seed, height, rng, stage="tune")
+        for q, height in (("1", 0.2), ("1.5", 0.4))
+        for seed in range(8)
+    ]
+    tune = [(one, points._replace(times=[DONE + 5] * len(points.times))) for one, points in tune]
+    found = study_of(sweep_of([*train, *tune], versions))
+    assert [one.hypothesis.text for one in found.planned if one.hypothesis] == [old, new]
+    assert (found.late, found.dropped) == ((late,), (old,))
 
 
 def test_settings_that_a_hypothesis_does_not_name_are_averaged(rng: np.random.Generator) -> None:
@@ -452,6 +497,68 @@ def test_verdicts_do_not_change_when_another_task_or_comparison_finishes(
     of_slide = [(replace(one, status="SCHEDULED"), Points()) for one, _ in runs[tasks[1], "1"]]
     more = study_of(sweep_of([*runs[tasks[0], "1"], *runs[tasks[0], "1.5"], *of_slide]))
     assert (more.family, len(more.unplanned)) == (3, 1)
+
+
+def test_the_family_is_that_of_the_compared_metric(rng: np.random.Generator) -> None:
+    """Rates are also compared over all tasks, and returns are not."""
+    runs = []
+    for task in ("FetchPush", "FetchSlide"):
+        for record, points in study({"1": 0.2, "1.5": 0.4}, 8, rng):
+            tags = {**record.tags, names.TAG_TASK: task, names.TAG_NODE_KEY: record.run_id + task}
+            params = {**record.params, "task.success_key": "None"}
+            more = [names.EVAL_RETURN] * len(points.metrics)
+            other = Points(more, points.steps, points.times, [-10 + v for v in points.values])
+            both = Points(*(x + y for x, y in zip(points, other, strict=True)))
+            runs.append((replace(record, tags=tags, params=params), both))
+    sweep = sweep_of(runs)
+    for metric, family in ((None, 2), (names.EVAL_SUCCESS, 3)):
+        found = study_of(sweep, metric=metric)
+        assert (found.family, len(found.claims)) == (family, family)
+        for claim in found.claims:
+            assert claim.p_value is not None
+            assert claim.p_value >= float(claim.contrast.p_value)
+
+
+def test_a_hypothesis_is_about_the_tasks_of_both_stages(rng: np.random.Generator) -> None:
+    runs = [
+        run({"tac.entropic_index": "1"}, seed, height, rng, task=task, stage=stage)
+        for stage, task, height in (
+            ("her", "FetchPush", 0.2),
+            ("her", "FetchSlide", 0.2),
+            ("music", "FetchPush", 0.4),
+        )
+        for seed in range(6)
+    ]
+    budget = {"FetchPush": BUDGET, "FetchSlide": BUDGET}
+    text = "stage = music against stage = her"
+    versions = with_plan((), plan(text, stage="her", budget=budget), 5)
+    found = study_of(sweep_of(runs, versions))
+    assert (found.family, found.untested) == (1, ())
+
+
+def test_the_answer_counts_runs_of_all_planned_stages(rng: np.random.Generator) -> None:
+    """The displayed stage need not be the compared one."""
+    train = study({"1": 0.3, "1.5": 0.3}, 8, rng)
+    train[0] = (replace(train[0][0], status="FAILED"), train[0][1])
+    tune = [
+        run({"tac.entropic_index": q}, seed, 0.0, rng, stage="tune")
+        for q in ("1", "1.5")
+        for seed in range(8)
+    ]
+    text = "stage = train, q = 1.5 against stage = train, q = 1"
+    sweep = sweep_of([*train, *tune], with_plan((), plan(text, stage="tune"), 5))
+    said = " ".join(answer(sweep, study_of(sweep)))
+    assert "31 of 32 runs finished. 1 failed run counts with the worst value" in said
+    assert "80% power" in said
+    assert "of a bound" not in said
+
+
+def test_returns_that_all_diverged_are_named() -> None:
+    record, _ = run({"tac.entropic_index": "1"}, 0, 0.3, np.random.default_rng(0))
+    record = replace(record, params={**record.params, "task.success_key": "None"})
+    points = Points([names.EVAL_RETURN] * 2, [0, BUDGET], [DONE] * 2, [-10.0, np.nan])
+    sweep = sweep_of([(record, points)])
+    assert answer(sweep, study_of(sweep))[1:] == ["No run has a result: 1 failed or diverged."]
 
 
 def test_failed_runs_have_the_worst_score_and_unfinished_ones_block_a_verdict(
