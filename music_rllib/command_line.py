@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
 import shlex
 import shutil
 import sys
-from collections.abc import Collection, Iterable, Iterator
-from typing import TYPE_CHECKING, Annotated, Any
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, Annotated, Any, TextIO, cast
 
 import typer
 
@@ -54,17 +55,54 @@ def how_to_continue() -> str:
     """The message of a stopped sweep: what is kept, and the command that continues it."""
     from music_rllib.redaction import redact
 
-    command = redact(shlex.join([*called_as(), *sys.argv[1:]]))
+    command = redact(shlex.join([*called_as(), *_without_retrain(sys.argv[1:])]))
     return f"Stopped. Finished runs and the last checkpoints are kept; continue with: {command}"
+
+
+def _without_retrain(arguments: Sequence[str]) -> list[str]:
+    """Arguments that may be repeated: the sweep has recorded what remains to be retrained."""
+    pairs = zip(["", *arguments], arguments, strict=False)
+    return [
+        word
+        for before, word in pairs
+        if "--retrain" not in (before, word) and not word.startswith("--retrain=")
+    ]
 
 
 def say_stopped_at_once() -> None:
     """Print `how_to_continue` from a signal handler, just before the process ends."""
-    os.write(sys.stderr.fileno(), f"\nAt once: {how_to_continue()}\n".encode())
+    with contextlib.suppress(OSError):
+        os.write(sys.stderr.fileno(), f"\nAt once: {how_to_continue()}\n".encode())
 
 
-def console_for(*, as_json: bool = False) -> Console:
-    """The console for people: standard output, or standard error if JSON goes to the former."""
+class _Unfailing:
+    """An output stream that loses text when its reader has ended or its disk is full."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        with contextlib.suppress(OSError):
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        try:
+            self._stream.flush()
+        except BrokenPipeError:  # otherwise Python fails with exit code 120 at its end
+            os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
+        except OSError:
+            pass
+
+
+def console_for(*, as_json: bool = False, unfailing: bool = False) -> Console:
+    """The console for people: standard output, or standard error if JSON goes to the former.
+
+    An `unfailing` one is for work that must not end because its output can't be written.
+    """
     from rich.console import Console
     from rich.segment import Segment
 
@@ -77,8 +115,10 @@ def console_for(*, as_json: bool = False) -> Console:
             for text, style, control in super().render(renderable, options):
                 yield Segment(text if control else printable(text), style, control)
 
-    terminal = (sys.stderr if as_json else sys.stdout).isatty()
+    stream = sys.stderr if as_json else sys.stdout
+    terminal = stream.isatty()
     return PrintableConsole(
+        file=cast("TextIO", _Unfailing(stream)) if unfailing else None,
         markup=False,  # [red] in a name is not a color
         emoji=False,
         highlight=False,

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from itertools import chain
+from itertools import chain, takewhile
 from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
@@ -34,10 +34,10 @@ from music_rllib.report.figures.choice import (
 from music_rllib.report.figures.draw import files
 from music_rllib.report.figures.plots import Legend, Subplot
 from music_rllib.report.page import SweepReport, render, runs_table
-from music_rllib.report.two_sweeps import difference_tables
+from music_rllib.report.two_sweeps import difference_tables, titles
 from music_rllib.report.videos import Videos, make_videos
 from music_rllib.results.analysis import METRICS, StageAnalysis, analyse, mixed
-from music_rllib.results.answer import claim_rows, mean_rows
+from music_rllib.results.answer import answer, claim_rows, mean_rows
 from music_rllib.results.conditions import StageRuns
 from music_rllib.results.data import ReportError, Sweep
 from music_rllib.results.statistics import Array
@@ -102,18 +102,32 @@ def build_report(
         study_drawings(study),
     )
     sentences = limitations(sweep, analyses, live=live or both is not None)
-    for one in both or ():  # each has a plan of its own
-        sentences += [f"{one.name}: {line}" for line in limitations(one, ())]
+    answers = answer(sweep, study)
+    if both is not None:  # each has a plan of its own
+        answers = [*_answers_of(both)]
+        sentences += [f"{one.name}: {line}" for one in both for line in _missing(one)]
     return SweepReport(
         sweep=sweep,
         analyses=analyses,
         study=study,
+        answer=answers,
         drawings=list(_with_own_names(_without_chance(drawings, stages))),
         differences=() if both is None else difference_tables(*both, analyses),
         limitations=[*sentences, *filter(None, [damaged])],
         command=command,
         videos=make_videos(sweep, analyses, storage, environments) if videos else Videos(),
     )
+
+
+def _answers_of(sweeps: tuple[Sweep, Sweep]) -> Iterator[str]:
+    """The questions and verdicts of two sweeps."""
+    for title, sweep in zip(titles(*sweeps), sweeps, strict=True):
+        sentences = answer(sweep, study_of(sweep))
+        yield from (f"{title}: {line}" for line in takewhile(_is_no_detail, sentences))
+
+
+def _is_no_detail(sentence: str) -> bool:
+    return not sentence.startswith("Metric: ")
 
 
 def _without_chance(drawings: Iterator[Drawing], stages: Sequence[StageRuns]) -> Iterator[Drawing]:
@@ -147,22 +161,29 @@ def limitations(
 
     In a `live` sweep no run is missing yet.
     """
-    sentences = [] if live else [*_missing_runs(sweep)]
-    sentences += filter(None, [sweep.earlier])
+    sentences = [] if live else [*_missing(sweep)]
     tags = ((run, run.tags.get(names.TAG_ENVIRONMENT, "")) for run in sweep.runs)
     sentences += mixed((run.task, run.name, digest) for run, digest in tags if run.is_finished)
     return [*sentences, *_missing_results(sweep, analyses), *_diverged(sweep)]
 
 
+def _missing(sweep: Sweep) -> Iterator[str]:
+    yield from _missing_runs(sweep)
+    if sweep.earlier:
+        yield sweep.earlier
+
+
 def _missing_runs(sweep: Sweep) -> Iterator[str]:
-    waiting = [run.name for run in sweep.runs if run.status == "SCHEDULED"]
+    # Runs that a search has stopped are in its table.
+    runs = [run for run in sweep.runs if names.TAG_PRUNED not in run.tags]
+    waiting = [run.name for run in runs if run.status == "SCHEDULED"]
     if len(waiting) == len(sweep.runs):
         yield "No run has begun, so there is nothing to draw or compare."
     if waiting:
         short = ShortLabels.of(run.name for run in sweep.runs)
         yield f"{in_runs(len(waiting))} not begun: {_listed([*map(short, waiting)])}."
     # Damaged runs have a cause as well, and a sentence of their own.
-    states = Counter(r.status for r in sweep.runs if not (r.status == "KILLED" and r.failure))
+    states = Counter(r.status for r in runs if not (r.status == "KILLED" and r.failure))
     for state, text in _STATES.items():
         if states[state]:
             yield f"{in_runs(states[state])} {text}."
@@ -181,7 +202,10 @@ def _missing_results(sweep: Sweep, analyses: Sequence[StageAnalysis]) -> Iterato
         unfinished = [
             condition.label
             for condition in stage.conditions
-            if not any(sweep.runs[run].is_finished for run in condition.runs)
+            if not any(
+                sweep.runs[run].is_finished or names.TAG_PRUNED in sweep.runs[run].tags
+                for run in condition.runs
+            )
         ]
         if unfinished and len(unfinished) < len(stage.conditions):
             yield f"Stage {stage.name}: no run of {_listed(unfinished)} has finished."

@@ -138,8 +138,7 @@ def _export(
     from music_rllib.results.data import ReportError
     from music_rllib.results.read import read_sweep
 
-    whole = read_sweep(place, storage).sweep
-    sweep, earlier = whole.having(lambda run: run.status != "SCHEDULED"), None
+    sweep, earlier = read_sweep(place, storage).sweep, None
     if is_archive(folder):
         # What an interrupted export has left may be replaced.
         with contextlib.nullcontext() if add else contextlib.suppress(ReportError):
@@ -150,7 +149,7 @@ def _export(
             f"{folder}: it has {earlier.name!r}, not {sweep.name!r}"
         )
     if add and earlier is not None:
-        sweep = merged(earlier.having(partial(_is_kept, whole)), sweep)
+        sweep = merged(earlier.having(partial(_is_kept, sweep)), sweep)
     write_archive(sweep, folder, table_format.value)
     if sweep.earlier:
         typer.echo(sweep.earlier)
@@ -184,7 +183,6 @@ def _report(
     from music_rllib.report.build import PICTURE, WANTED, build_report, write_report
     from music_rllib.report.figures.choice import slug
     from music_rllib.report.two_sweeps import joined_sweeps
-    from music_rllib.results.answer import answer
     from music_rllib.results.data import ReportError
     from music_rllib.results.read import read_sweep
 
@@ -208,14 +206,14 @@ def _report(
     page = write_report(made, output or first.folder / name)
     for sentence in made.limitations:
         typer.echo(f"missing: {for_people(sentence)}")
-    for sentence in answer(sweep, made.study):
+    for sentence in made.answer:
         typer.echo(for_people(sentence))
     typer.echo(f"Report: {page.absolute()}")
     picture = page.parent / "figures" / f"{PICTURE}.png"
     if picture.exists():
         typer.echo(f"Picture: {picture.absolute()}")
     if attach and first.opened is not None:
-        _attach(first.sweep, first.opened, page.parent, made)
+        _attach(first.opened, page.parent, made)
     if damaged:
         typer.echo(f"error: {redact(damaged)}", err=True)
         return FAILED
@@ -253,14 +251,13 @@ def _serve(place: str, storage: str | None, port: int) -> None:
     serve(make_server(page, port), page, typer.echo)
 
 
-def _attach(sweep: Sweep, opened: OpenSweep, folder: Path, made: SweepReport) -> None:
+def _attach(opened: OpenSweep, folder: Path, made: SweepReport) -> None:
     """Store the report, in `folder`, with the sweep's run in MLflow."""
     from music_rllib.report.build import made_files
-    from music_rllib.results.answer import answer
     from music_rllib.tracking.tracker import SweepRun
 
     run = SweepRun.of(opened)
-    note = _note(answer(sweep, made.study)[1], made, run.run_id)
+    note = _note(made.answer[1], made, run.run_id)
     run.attach(folder, made_files(folder), "report", note)
     typer.echo(f"Attached to the sweep's run in MLflow: {run.page}")
 

@@ -2,7 +2,7 @@
 "use strict";
 
 const asked = (path) => fetch(path, { cache: "no-store" });
-const PARTS = ["facts", "notes", "answer", "curves", "details", "groups", "searches", "origin"];
+const PARTS = ["facts", "notes", "answer", "curves", "details", "contents", "groups", "searches", "origin"];
 let version = document.body.dataset.version;
 
 function time(seconds) {

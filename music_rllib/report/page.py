@@ -21,7 +21,7 @@ from music_rllib.report.figures.choice import COST, GROUPS, PERFORMANCE, PRIMARY
 from music_rllib.report.figures.draw import inline
 from music_rllib.report.videos import Videos
 from music_rllib.results.analysis import StageAnalysis
-from music_rllib.results.answer import answer, planned_in_words
+from music_rllib.results.answer import planned_in_words
 from music_rllib.results.conditions import SIDE_BY_SIDE, StageRuns
 from music_rllib.results.data import Sweep
 from music_rllib.results.study import Study
@@ -71,6 +71,8 @@ class SweepReport:
     analyses: Sequence[StageAnalysis]
     study: Study
     """The planned comparisons and all others."""
+    answer: Sequence[str]
+    """The study in sentences, the question first; of two sweeps, both studies."""
     drawings: Sequence[Drawing]
     limitations: Sequence[str]
     """Sentences about missing runs and about runs to treat with care."""
@@ -98,7 +100,9 @@ def render(report: SweepReport, *, live: bool = False) -> str:
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     data = chart_data(sweep, report.drawings)
     numbers = {stage["name"]: number for number, stage in enumerate(data["stages"])}
-    sentences = answer(sweep, report.study)[1:] if report.analyses else []
+    sentences = [*report.answer] if report.analyses else []
+    if not report.differences:
+        sentences = sentences[1:]
     # The verdicts are in large letters; the metric, seeds and control follow in small ones.
     details = (i for i, line in enumerate(sentences) if line.startswith("Metric:"))
     claims = next(details, len(sentences))
@@ -159,6 +163,8 @@ def _facts(report: SweepReport) -> Sequence[tuple[str, object]]:
 
 def _question(report: SweepReport) -> str:
     """The question of the plan, or the one that the sweep's conditions ask."""
+    if report.differences:
+        return f"How do {report.sweep.name} differ?"
     if report.study.question is not None:
         return report.study.question
     if not report.analyses:

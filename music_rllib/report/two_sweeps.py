@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -18,14 +19,15 @@ MOST_VALUES = 6
 
 def joined_sweeps(first: Sweep, second: Sweep) -> Sweep:
     """All runs of both sweeps; stage names begin with the sweep, so that stages are compared."""
-    titles = _titles(first, second)
-    both = merged(_renamed(first, titles[0]), _renamed(second, titles[1]))
+    names_of = titles(first, second)
+    both = merged(*map(_renamed, (first, second), names_of))
     return replace(
-        both, name=" and ".join(titles), config=None, plans=(), searches=(), earlier=None
+        both, name=" and ".join(names_of), config=None, plans=(), searches=(), earlier=None
     )
 
 
-def _titles(first: Sweep, second: Sweep) -> tuple[str, str]:
+def titles(first: Sweep, second: Sweep) -> tuple[str, str]:
+    """Two different names."""
     if first.name != second.name:
         return first.name, second.name
     return f"{first.name} (first)", f"{second.name} (second)"
@@ -56,11 +58,11 @@ def difference_tables(
         second: The second sweep.
         analyses: The analyses of the sweep that :func:`joined_sweeps` makes of them.
     """
-    titles = _titles(first, second)
-    return [_settings_table(first, second, titles), _results_table(analyses, titles)]
+    both = titles(first, second)
+    return [_settings_table(first, second, both), _results_table(analyses, both)]
 
 
-def _settings_table(first: Sweep, second: Sweep, titles: tuple[str, str]) -> Table:
+def _settings_table(first: Sweep, second: Sweep, both: tuple[str, str]) -> Table:
     one, other = _setting_values(first), _setting_values(second)
     rows = [
         (*key, _values_text(one.get(key)), _values_text(other.get(key)))
@@ -69,7 +71,7 @@ def _settings_table(first: Sweep, second: Sweep, titles: tuple[str, str]) -> Tab
     ]
     return Table(
         title="Settings that differ",
-        header=("In stage", "Setting", *titles),
+        header=("In stage", "Setting", *both),
         rows=rows or [("all", "none", None, None)],
     )
 
@@ -92,8 +94,8 @@ def _values_text(values: set[str] | None) -> str | None:
     return ", ".join(sorted(values)[:MOST_VALUES]) + (f" and {more} more" if more > 0 else "")
 
 
-def _results_table(analyses: Sequence[StageAnalysis], titles: tuple[str, str]) -> Table:
-    one, other = (_finals(analyses, title) for title in titles)
+def _results_table(analyses: Sequence[StageAnalysis], both: tuple[str, str]) -> Table:
+    one, other = (_finals(analyses, title) for title in both)
     rows = []
     for key in dict.fromkeys((*one, *other)):
         found = [finals[key].estimate if key in finals else None for finals in (one, other)]
@@ -102,7 +104,7 @@ def _results_table(analyses: Sequence[StageAnalysis], titles: tuple[str, str]) -
         rows.append((*key, *found, gap))
     return Table(
         title="Final values of both sweeps",
-        header=("In stage", "Task", "Condition", *titles, "Difference"),
+        header=("In stage", "Task", "Condition", *both, "Difference"),
         rows=rows,
         note="Means of the last evaluation of finished runs with their 95% CI. Difference: second "
         "sweep minus first sweep.",
@@ -114,12 +116,13 @@ def _finals(
 ) -> dict[tuple[str, str, str], FinalScores]:
     """Final values of a sweep by stage, task and condition, without its title."""
     start = f"{title}: "
+    in_label = re.compile(rf"(^|, ){re.escape(start)}")
     return {
         # A setting of what a condition starts from has the sweep's title, too.
         (
             analysis.stage.name.removeprefix(start),
             scope.name,
-            final.condition.label.replace(start, ""),
+            in_label.sub(r"\1", final.condition.label),
         ): final
         for analysis in analyses
         if analysis.stage.name.startswith(start)

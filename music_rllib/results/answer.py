@@ -18,6 +18,7 @@ from music_rllib.results.statistics import (
     MAX_SEEDS,
     SIGNIFICANCE,
     Estimate,
+    difference_text,
     interval_text,
     number,
     p_text,
@@ -98,7 +99,7 @@ def planned_in_words(study: Study) -> str:
         return f"{text}; changed afterwards: {', '.join(changed)}" if changed else text
     if latest is not None:
         return f"recorded {latest.recorded}, after the first run had finished: not planned"
-    return "no comparison was planned in advance: all comparisons are exploratory"
+    return "no comparison was planned in advance: all pairs of conditions are compared"
 
 
 def _changed(before: AnalysisPlan, after: AnalysisPlan) -> list[str]:
@@ -158,8 +159,8 @@ def p_in_words(claim: Claim) -> str:
 
 def numbers_in_words(claim: Claim) -> str:
     """`+0.12 (95% CI 0.05 to 0.19; p = 0.002)`."""
-    value = claim.contrast.difference.value
-    gap = f"{float(value):+.2f}" if abs(value) < 100 else f"{float(value):+,.0f}"
+    is_equivalent = claim.verdict is Verdict.EQUIVALENT
+    gap = difference_text(claim.contrast.within if is_equivalent else claim.contrast.difference)
     return f"{gap} ({'; '.join(filter(None, (interval_in_words(claim), p_in_words(claim))))})"
 
 

@@ -89,9 +89,7 @@ class StageRuns:
 
         Selection biases the best of a search's trials upwards on the seeds that selected it.
         """
-        if not self.is_search:
-            return self.conditions
-        return tuple(one for one in self.conditions if one.is_fresh)
+        return tuple(one for one in self.conditions if (SEEDS, SEARCHED) not in one.others)
 
     @property
     def has_task_reward(self) -> bool:

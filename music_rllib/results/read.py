@@ -188,6 +188,8 @@ def _reader(
             # Not FAILED, which has the worst score: the run has a result that can't be read.
             run = replace(run, status="KILLED", tags={**run.tags, names.TAG_FAILURE: str(error)})
             return _Run(run, damage=error)
+        if node.key in pruned:
+            run = replace(run, tags={**run.tags, names.TAG_PRUNED: "by the search"})
         if (cause := causes.get(node.key)) is not None:
             run = replace(run, status="FAILED", tags={**run.tags, names.TAG_FAILURE: cause})
         elif node.key in begun:

@@ -52,6 +52,11 @@ class Estimate:
     upper: Array
 
     @property
+    def numbers(self) -> tuple[float, float, float]:
+        """Value and ends of a single estimate."""
+        return float(self.value), float(self.lower), float(self.upper)
+
+    @property
     def has_interval(self) -> bool:
         return bool(np.all(np.isfinite(self.lower) & np.isfinite(self.upper)))
 
@@ -297,27 +302,45 @@ def number(value: float | Array) -> str:
 def with_interval(value: float | None, ends: Sequence[float | None] | None) -> str:
     """`0.45 [0.30, 0.60]`, or `0.45` without an interval.
 
-    Two decimals, none from 100 on, and as many as a narrower interval needs.
+    The decimals are those of :func:`interval_text`.
     """
     if value is None:
         return "-"
     low, high = ends or (None, None)
     if low is None or high is None or low != low or high != high:
         return number(value) if abs(value) >= 100 else f"{value:.3g}"
+    return "{} [{}, {}]".format(*_alike(value, low, high))
+
+
+def _alike(value: float, low: float, high: float) -> tuple[str, str, str]:
+    """The numbers of an estimate with the same decimals.
+
+    Two decimals, none from 100 on, and as many as a narrower interval needs.
+    """
     decimals = 0 if max(abs(value), abs(low), abs(high)) >= 100 else 2
     if 0 < high - low < math.inf:
         decimals = max(decimals, -math.floor(math.log10(high - low)))
     value, low, high = (round(one, decimals) + 0.0 for one in (value, low, high))
-    return f"{value:,.{decimals}f} [{low:,.{decimals}f}, {high:,.{decimals}f}]"
+    return f"{value:,.{decimals}f}", f"{low:,.{decimals}f}", f"{high:,.{decimals}f}"
 
 
 def interval_text(estimate: Estimate) -> str:
     """`0.62 to 0.81`, or `no interval`."""
     if not estimate.has_interval:
         return "no interval"
-    return f"{number(estimate.lower)} to {number(estimate.upper)}"
+    return "{1} to {2}".format(*_alike(*estimate.numbers))
+
+
+def difference_text(estimate: Estimate) -> str:
+    """`+0.12`, with as many decimals as its interval."""
+    text = _alike(*estimate.numbers)[0]
+    return text if text.startswith("-") else f"+{text}"
 
 
 def p_text(p_value: float) -> str:
     """`p = 0.03`."""
-    return "p < 0.001" if p_value < 0.001 else f"p = {p_value:.2g}"
+    if p_value < 0.001:
+        return "p < 0.001"
+    texts = (f"{p_value:.{digits}g}" for digits in range(2, 18))
+    side = np.sign(p_value - SIGNIFICANCE)
+    return "p = " + next(one for one in texts if np.sign(float(one) - SIGNIFICANCE) == side)

@@ -114,7 +114,7 @@ def study_of(
     chosen = stages.get(stage or (latest.plan.stage if latest else ""))
     if chosen is None and stage is None:
         chosen = next((s for s in reversed(stages.values()) if s.has_task_reward), None)
-    pairs = _pairs(chosen.compared) if chosen else []
+    pairs = pairs_of(chosen.compared) if chosen else []
     if latest and not pairs and stage in (None, latest.plan.stage):
         of_hypotheses = [found for name, found in stages.items() if name in latest.plan.stages]
         chosen = stages_together(of_hypotheses) or chosen
@@ -251,14 +251,14 @@ def _of_plan(
         yield from (replace(claim, hypothesis=hypothesis) for claim in claims)
 
 
-def _tasks_of_all(sweep: Sweep, stages: Collection[str], planned: Set[str]) -> set[str]:
+def _tasks_of_all(sweep: Sweep, stages: Collection[str], planned: Set[str]) -> Set[str]:
     """The tasks that all stages have, or will have: runs that have not begun may be unknown."""
     unknown = planned - {run.task for run in sweep.runs}
     known = [{run.task for run in sweep.runs if run.stage == stage} for stage in stages]
-    return set.intersection(*((tasks or planned) | unknown for tasks in known))
+    return frozenset[str].intersection(*(frozenset(one or planned) | unknown for one in known))
 
 
-def _pairs(conditions: Sequence[Condition]) -> list[tuple[Condition, Condition]]:
+def pairs_of(conditions: Sequence[Condition]) -> list[tuple[Condition, Condition]]:
     """Pairs of a later condition and an earlier one; of many conditions, each and its reference.
 
     The reference has the same other settings and q = 1, or the smallest q. If no two conditions

@@ -12,7 +12,6 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +19,7 @@ import numpy as np
 from music_rllib import names
 from music_rllib.experiment.plan import short
 from music_rllib.results import statistics as st
-from music_rllib.results.analysis import StageAnalysis
+from music_rllib.results.analysis import FinalScores, Scope, StageAnalysis
 from music_rllib.results.answer import (
     interval_in_words,
     not_excluded,
@@ -28,7 +27,7 @@ from music_rllib.results.answer import (
     verdict_in_words,
 )
 from music_rllib.results.statistics import FEWEST_FOR_INTERVAL, SHOW_SEEDS_BELOW, Estimate, number
-from music_rllib.results.study import Study
+from music_rllib.results.study import Study, pairs_of
 
 DASH = "–"
 """Stands in a table for a missing value."""
@@ -186,12 +185,13 @@ Entry = Mapping[str, Any]
 
 def study_tables(study: Study) -> list[Table]:
     """The comparisons, planned ones first, and the primary metric of each condition."""
-    kind = study.means[0].measure.kind_in_words if study.means else "area under the curve"
     claims = (*study.planned, *study.unplanned)
+    kinds = [found[0].measure.kind_in_words for found in (claims, study.means) if found]
+    kinds = kinds or ["area under the curve"]
     measures = " or ".join(dict.fromkeys(claim.measure.words for claim in claims))
     comparisons = Table(
         name="comparisons",
-        title=f"Comparisons by the {kind}",
+        title=f"Comparisons by the {kinds[0]}",
         header=("Task", "Pair", "Difference", "Interval", "p", "Verdict", "Planned", "Seeds"),
         rows=[
             (
@@ -211,7 +211,7 @@ def study_tables(study: Study) -> list[Table]:
     )
     means = Table(
         name="area_under_curve",
-        title=f"{kind.capitalize()} of each condition",
+        title=f"{kinds[-1].capitalize()} of each condition",
         header=("Task", "Condition", "Measure", "Mean", "Each seed", "Finished", "Runs"),
         rows=[
             (
@@ -289,12 +289,17 @@ def performance_tables(analyses: Sequence[StageAnalysis]) -> list[Table]:
                     Share(st.improvement(first.scores, second.scores)),
                 )
                 for analysis, scope in scopes
-                for second, first in combinations(scope.compared, 2)
+                for first, second in _pairs_of_finals(scope)
             ],
             note="Differences of the means, without a test. Probability of improvement: a run of "
             "the first condition ends higher than a run of the second (ties count half).",
         ),
     ]
+
+
+def _pairs_of_finals(scope: Scope) -> Iterator[tuple[FinalScores, FinalScores]]:
+    finals = {final.condition: final for final in scope.compared}
+    return ((finals[one], finals[other]) for one, other in pairs_of(list(finals)))
 
 
 def _thresholds(analyses: Sequence[StageAnalysis]) -> Table:
@@ -351,7 +356,7 @@ def search_tables(search: Entry) -> Iterator[Table]:
         title="Ranking on fresh seeds",
         note="These settings were trained again with seeds that the search did not use, so that "
         "selection does not bias them. Last column: the probability that a run of the best "
-        "setting ends higher than a run of this one.",
+        "setting ends better than a run of this one.",
         header=(
             *("Rank", "Trial", *settings, *aims, "Seeds"),
             *("In the search", "Probability that the best is better"),

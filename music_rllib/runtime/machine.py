@@ -152,7 +152,9 @@ def _is_left_by_ray(folder: Path) -> bool:
 
 
 def check_cpus(resources: Resources) -> int | None:
-    """Number of CPUs for a local Ray; None if Ray decides, or with a cluster.
+    """Number of CPUs for a local Ray; None if Ray counts them, or with a cluster.
+
+    Ray counts those of a container, but not those of `taskset` or of a job of Slurm.
 
     Raises:
         ClusterError: This machine has fewer CPUs than `resources` asks for.
@@ -166,7 +168,8 @@ def check_cpus(resources: Resources) -> int | None:
             raise ClusterError(
                 f"resources.{name} must be <= {here}, the CPUs of this machine, got {asked}"
             )
-    return resources.num_cpus
+    limited = here if here < (os.cpu_count() or here) else None
+    return resources.num_cpus or limited
 
 
 def check_memory_and_gpus(resources: Resources) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -158,6 +158,22 @@ def _nodes(location: SweepLocation) -> list[dict[str, Any]]:
         *({"key": key, "label": f"{key} (imported)", "input": None} for key in imported),
         *({**one, "label": f"{one['label']} (earlier version)", "input": None} for one in earlier),
     ]
+
+
+def check_not_in_use(location: SweepLocation, keys: Collection[str]) -> None:
+    """Check that no other running sweep has any of these runs.
+
+    Raises:
+        BadInputError: A running sweep has one.
+    """
+    for other in sweeps_in(location.storage) if keys else ():
+        shared = [node["label"] for node in _nodes(other) if node["key"] in keys]
+        is_other = other.name != location.name
+        if is_other and shared and _is_driven(other, other.read(sweep_files.STATE)):
+            raise BadInputError(
+                f"--retrain must name no runs of a running sweep, {other.name} uses {shared[0]}: "
+                "stop it first"
+            )
 
 
 def _users(location: SweepLocation, nodes: Iterable[Mapping[str, Any]]) -> dict[str, list[str]]:

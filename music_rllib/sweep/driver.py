@@ -48,6 +48,7 @@ from music_rllib.runtime.process import early, without_collections
 from music_rllib.store.patience import be_patient
 from music_rllib.store.storage import check_storage, is_remote, resolve_storage
 from music_rllib.sweep import preflight
+from music_rllib.sweep.clean import check_not_in_use
 from music_rllib.sweep.preflight import check_demand
 from music_rllib.sweep.views.plan import cluster_answer, plan_answer, plan_view
 
@@ -130,7 +131,7 @@ def run(
         from music_rllib.sweep.driver_lock import alone, driving
         from music_rllib.sweep.execution import compute_and_report, open_tracker
 
-    console = console_for(as_json=as_json)
+    console = console_for(as_json=as_json, unfailing=True)
     warn = partial(_say, console, style="yellow")
     try:
         opened, _ = _open(console, config, lenient=retrain_damaged, wait_minutes=wait_minutes)
@@ -146,11 +147,11 @@ def run(
             contextlib.ExitStack() as stack,
             early,
         ):
-            with alone(opened.location, partial(_say, console)) as waited:
+            with alone(opened.location, partial(_say, console)):
                 if opened.damaged or again:
                     drivers.check_alone()
-                if waited:
-                    opened = reopened(opened)
+                check_not_in_use(opened.location, [run.key for run in again])
+                opened = reopened(opened)  # another command may have deleted runs
                 remove_damaged(opened, warn)
                 opened = accept_environments(remove_runs(opened, again, warn), kept, warn)
                 _check(opened)
@@ -160,7 +161,9 @@ def run(
                 keep_record(opened)
                 plans = _record_analysis_plan(console, opened)
                 shares = bool(drivers.others())
-            code = compute_and_report(console, opened, tracker, plans, drivers, shares=shares)
+            code = compute_and_report(
+                console, opened, tracker, plans, drivers, wait_minutes, shares=shares
+            )
         if as_json:
             print_json(opened.location.read(STATE) or {})
     except (KeyboardInterrupt, SystemExit) as stopped:
@@ -202,8 +205,8 @@ def _open(
     console.print(plan_view(config, planned, opened.finished))
     _say(console, f"Storage: {redact(storage)}")
     cluster = preflight.find_cluster(console, opened, wait_minutes)
-    memory = None if cluster is None else cluster.node_memory
-    check_demand(opened, memory)
+    if cluster is not None or cluster_address() is None:  # a Ray job connects later
+        check_demand(opened, None if cluster is None else cluster.node_memory)
     warnings = (*warnings_of(config), *remarks(planned), *continued_runs_text(opened))
     for line in filter(None, (remark, *played, *warnings)):
         _say(console, line, "yellow")

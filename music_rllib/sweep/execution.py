@@ -69,13 +69,14 @@ def compute_and_report(
     tracker: Tracker,
     plans: Sequence[dict[str, Any]],
     drivers: Drivers,
+    wait_minutes: float | None,
     *,
     shares: bool,
 ) -> int:
     """Compute what is left, show the results and write the report; the exit code.
 
-    `plans` are the recorded versions of the analysis plan as plain data, `shares` says whether
-    another driver runs the sweep already.
+    `plans` are the recorded versions of the analysis plan as plain data, `wait_minutes` is the time
+    to wait for a cluster's nodes, `shares` says whether another driver runs the sweep already.
     """
     if plans:
         tracker.put_sweep_artifact(names.ARTIFACT_ANALYSIS_PLAN, as_json(plans))
@@ -91,7 +92,7 @@ def compute_and_report(
         if opened.plan.searched:
             controller = begin_searches(opened, display, mlflow_log, state_file, alone=not shares)
         tracker.keep_current(node.key for node in opened.plan.nodes)
-        stopped_by = _compute(opened, display, mlflow_log, state_file, controller)
+        stopped_by = _compute(opened, display, mlflow_log, state_file, controller, wait_minutes)
         searches = [] if controller is None else end_searches(opened, controller, tracker)
         tracker.keep_current(node.key for node in opened.plan.nodes)  # with trials since then
         lost = _lost_trials(searches)
@@ -154,6 +155,7 @@ def _compute(
     mlflow_log: MlflowListener,
     state_file: StateFile,
     controller: SearchController | None,
+    wait_minutes: float | None,
 ) -> int | None:
     """Compute what is left, if anything; the signal that stopped it, or None."""
     if opened.scheduler.complete and (controller is None or controller.over):
@@ -184,7 +186,7 @@ def _compute(
 
     try:
         listeners = [mlflow_log, display, state_file, gauges, *searches]
-        return compute(opened, listeners, on_stop, on_ray_gone, controller)
+        return compute(opened, listeners, on_stop, on_ray_gone, controller, wait_minutes)
     finally:
         gauges.close()
 

@@ -356,7 +356,9 @@ def open_client(store: TrackingStore) -> MlflowClient:
             is_new = not store.database.exists()
             if is_new:
                 with contextlib.suppress(OSError, RuntimeError):
-                    shutil.copyfile(empty_database(VERSION), store.database)
+                    draft = store.database.with_suffix(".draft")
+                    shutil.copyfile(empty_database(VERSION), draft)
+                    draft.replace(store.database)
             client = MlflowClient(store.uri)
             client.search_experiments(max_results=1)
             if is_new:

@@ -20,6 +20,7 @@ from urllib.parse import parse_qsl, unquote, urlsplit
 
 from music_rllib.errors import TrackingError
 from music_rllib.experiment.sweep_files import SweepLocation, as_json
+from music_rllib.names import VARIABLE_STUDIES
 from music_rllib.redaction import redact
 from music_rllib.store.storage import (
     StorageError,
@@ -142,6 +143,8 @@ def resolve_store(tracking_uri: str | None, storage: str) -> TrackingStore:
         artifacts = f"{redact(storage).partition('?')[0].rstrip('/')}/mlartifacts"
     else:
         artifacts = (folder / "mlartifacts").as_uri()
+    if tracking_uri and (own := os.environ.get(VARIABLE_STUDIES)) and own in tracking_uri:
+        artifacts = (Path(own) / "mlartifacts").as_uri()  # temporary, like the database
     if tracking_uri is None:
         if folder is None:
             raise TrackingError(

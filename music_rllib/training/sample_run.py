@@ -8,10 +8,11 @@ from typing import Any, NamedTuple
 
 import psutil
 import ray
-from ray.exceptions import RayTaskError
+from ray.exceptions import RayError, RayTaskError
 
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.schema import Resources
+from music_rllib.errors import BadInputError, first_line
 from music_rllib.training.failure_reason import in_words_only
 from music_rllib.training.run import TrainingRun
 
@@ -61,6 +62,8 @@ def sample_run(run: RunSettings, resources: Resources, at_once: int) -> RunSampl
         return RunSample(started, fmean(speeds), fmean(evaluations), max(memory))
     except RayTaskError as error:
         raise error.cause from None
+    except RayError as error:  # its process has died
+        raise BadInputError(f"a run must be trained to be measured: {first_line(error)}") from error
     finally:
         for worker in workers:
             ray.kill(worker)

@@ -96,7 +96,7 @@ class RunTrainable(Trainable):
     def _step_or_leave(self) -> dict[str, Any]:
         try:
             return self._step()
-        except (LeaseLostError, StorageError):
+        except (LeaseLostError, StorageError, OSError):
             # The new owner may have deleted the folder into which this process was writing.
             if self._run_storage.lease is None or not self._run_storage.lease.is_lost():
                 raise

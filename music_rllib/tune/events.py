@@ -126,6 +126,8 @@ class TuneEvents(Callback):
             f"{cause} Another worker resumes from the last checkpoint "
             f"({len(deaths)} of {RESTARTS} times)."
         )
+        if len(deaths) > RESTARTS:
+            return  # it fails
         if self._store.work_folder(node.key).folder.read(RECORD) is not None:
             text = "its environment hangs, so its worker was ended; the next worker names the call"
         for listener in self._listeners:

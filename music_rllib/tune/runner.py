@@ -16,8 +16,7 @@ from ray.tune.experiment import Trial
 from ray.tune.schedulers import FIFOScheduler
 from ray.tune.search import Searcher
 
-from music_rllib.command_line import how_to_continue
-from music_rllib.errors import one_line
+from music_rllib.errors import FAILED, one_line
 from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.scheduler import Listener, Scheduler, Status
@@ -186,6 +185,7 @@ def compute(
     on_stop: Callable[[], None],
     on_ray_gone: Callable[[str | None], None],
     searches: Searches | None,
+    wait_minutes: float | None = None,
 ) -> int | None:
     """Compute the waiting nodes, and those that searches ask for.
 
@@ -196,6 +196,7 @@ def compute(
         on_ray_gone: Called, in a thread, before the process ends because Ray has ended: with the
             cause, or None if the user's signal ended Ray too.
         searches: The controller of the searches, if there are any.
+        wait_minutes: Time to wait for a cluster's nodes, as in `cluster`.
 
     Returns:
         The signal that stopped the sweep; None if everything was computed.
@@ -224,8 +225,13 @@ def compute(
         stopped=lambda: stopping.received is not None,
         shared=SharedRuns(sweep, listeners),
     )
+
+    def remark(text: str) -> None:
+        for listener in listeners:
+            listener.remarked(text)
+
     with (
-        cluster(resources) as capacity,
+        cluster(resources, wait_minutes, remark) as capacity,
         # Tune's files are never read. Not in the storage: if that is full, or does not answer,
         # Tune must not stop the runs.
         own_folder("music-tune-") as folder,
@@ -233,8 +239,7 @@ def compute(
         stopping,
     ):
         if capacity.remark is not None:
-            for listener in listeners:
-                listener.remarked(capacity.remark)
+            remark(capacity.remark)
         for number in count():
             if not _wait_for_a_run(searcher, stopping, listeners):
                 break
@@ -268,11 +273,11 @@ def compute(
                     break
                 if (cause := _file_error(error)) is None:
                     raise
-                raise StorageError(
+                on_ray_gone(
                     "the storage and the folder for temporary files must answer, got "
-                    f"{one_line(cause)}. Finished runs and the last checkpoints are kept. "
-                    f"{how_to_continue()}"
-                ) from error
+                    f"{one_line(cause)}"
+                )
+                raise SystemExit(FAILED) from error
     done = sweep.scheduler.complete and (searches is None or searches.over)
     return None if done else stopping.received
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shlex
@@ -93,6 +94,35 @@ print(raw.buffer.getvalue().decode("ascii"))
     assert "name must be letters" in done.stderr
     assert r'"\u03b1"' in done.stderr
     assert done.stderr.count("the current folder must exist and be readable: No such file") == 6
+
+
+@pytest.mark.parametrize("output", ["a reader that ends", "a full disk"])
+def test_a_sweep_outlives_its_output(output: str) -> None:
+    code = """
+import sys
+from music_rllib.command_line import console_for
+console = console_for(unfailing=True)
+for number in range(2000):
+    console.print("line", number)
+print("trained", file=sys.stderr)
+"""
+    with Path("/dev/full").open("w") as full, contextlib.ExitStack() as stack:
+        target: Any = full
+        if output == "a reader that ends":
+            reader = subprocess.Popen(["head", "-n", "1"], stdin=-1, stdout=-3)
+            stack.callback(reader.wait)
+            assert reader.stdin is not None
+            target = stack.enter_context(reader.stdin)
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
+            stdout=target,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+    assert done.stderr.startswith("trained\n")
+    if output == "a reader that ends":
+        assert (done.returncode, done.stderr) == (0, "trained\n")
 
 
 def test_every_help_page_has_the_same_format(

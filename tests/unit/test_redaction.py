@@ -300,3 +300,11 @@ def test_the_command_that_continues_a_sweep_has_no_passwords(
     said = how_to_continue()
     assert "planted" not in said
     assert said.endswith("run my.yaml --storage s3://bucket/x mlflow.tracking_uri=http://host:5000")
+
+
+def test_the_command_that_continues_a_sweep_deletes_no_results(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    options = ["--retrain", "FetchPush", "--keep-runs", "--retrain=her", "--retrain-damaged"]
+    monkeypatch.setattr(sys, "argv", ["music-rllib", "run", "my.yaml", *options, "seeds=5"])
+    assert how_to_continue().endswith("run my.yaml --keep-runs --retrain-damaged seeds=5")

@@ -123,7 +123,7 @@ def _without_trials(sweep: Sweep, stage: StageRuns) -> StageRuns:
 
 def drawings_of_stages(sweep: Sweep, stages: Sequence[StageRuns]) -> Iterator[Drawing]:
     """Curves of all stages that train for the task, together; none for a single stage."""
-    together = stages_together(stages)
+    together = stages_together([_without_trials(sweep, stage) for stage in stages])
     if together is not None:
         yield from _curves(sweep, together, OF_ALL_STAGES)
 

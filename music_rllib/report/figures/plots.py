@@ -400,6 +400,7 @@ def alpha_subplot(task: str, lines: Sequence[tuple[AlphaLine, Style]]) -> Subplo
         elif axes.get_xscale() == "log":
             # The scale's own labels are formulas, but text.parse_math is off.
             axes.xaxis.set_major_formatter(LogFormatter())
+            axes.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1, 0.4)))
         axes.set_xlabel("α (entropy coefficient)")
         axes.set_ylabel(lines[0][0][0][1].measure.words)
 

@@ -81,9 +81,13 @@ class StateFile(Listener):
         self._thread.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, *_: object
+    ) -> None:
+        # Until the runs begin, the handler that `ray.init` sets raises SystemExit.
+        terminated = isinstance(error, SystemExit) and error.code == signal.SIGTERM
         if self._driver["ended"] is None:
-            self.end("stopped" if kind is KeyboardInterrupt else "failed")
+            self.end("stopped" if kind is KeyboardInterrupt or terminated else "failed")
 
     def end(self, outcome: str) -> None:
         """Write the outcome of the sweep: `finished`, `failed` or `stopped`."""

@@ -460,7 +460,7 @@ SWEEPS: dict[str, Callable[[], tuple[Sweep, Sequence[str]]]] = {
         sweep_of(
             [(one_run("1", 0), Points([names.EVAL_SUCCESS] * 2, [1, 2], [1, 2], [0.5, np.nan]))]
         ),
-        ["No run has a result: 1 failed."],
+        ["No run has a result: 1 failed or diverged."],
     ),
 }
 

@@ -62,6 +62,15 @@ def test_conditions_that_differ_in_their_pretraining_are_matched() -> None:
     )
 
 
+def test_both_sweeps_have_an_answer() -> None:
+    first = read_archive(DATA / "proof-fetch-reach")
+    second = replace(first, name="a")
+    made = build_report(joined_sweeps(first, second), both=(first, second))
+    for name in ("proof-fetch-reach", "a"):
+        assert sum(line.startswith(f"{name}: ") for line in made.answer) >= 2
+    assert "How do proof-fetch-reach and a differ?" in render(made)
+
+
 def test_missing_runs_are_reported_with_their_sweep() -> None:
     first = read_archive(DATA / "proof-fetch-reach")
     *runs, last = first.runs

@@ -12,13 +12,15 @@ import pytest
 from rich.console import Console
 
 from music_rllib import names
-from music_rllib.report.figures.choice import study_drawings
+from music_rllib.report.figures.choice import drawings_of_stages, study_drawings
 from music_rllib.report.figures.draw import files
 from music_rllib.results.analysis_plan import AnalysisPlan, PlanVersion, checked_plans, with_plan
 from music_rllib.results.analysis_plan import as_document as plans_as_document
 from music_rllib.results.answer import answer, power_in_words
 from music_rllib.results.claims import Verdict
+from music_rllib.results.conditions import find_stages
 from music_rllib.results.data import Points, RunRecord, Sweep, columns
+from music_rllib.results.statistics import Estimate, difference_text, interval_text, p_text
 from music_rllib.results.study import Study, alpha_lines, study_of
 from music_rllib.results.tables import study_tables
 from music_rllib.sweep.views.results import console_table
@@ -506,9 +508,12 @@ def test_the_family_is_that_of_the_compared_metric(rng: np.random.Generator) -> 
         for record, points in study({"1": 0.2, "1.5": 0.4}, 8, rng):
             tags = {**record.tags, names.TAG_TASK: task, names.TAG_NODE_KEY: record.run_id + task}
             params = {**record.params, "task.success_key": "None"}
-            more = [names.EVAL_RETURN] * len(points.metrics)
-            other = Points(more, points.steps, points.times, [-10 + v for v in points.values])
-            both = Points(*(x + y for x, y in zip(points, other, strict=True)))
+            both = Points(
+                [*points.metrics, *[names.EVAL_RETURN] * len(points.metrics)],
+                [*points.steps, *points.steps],
+                [*points.times, *points.times],
+                [*points.values, *(value - 10 for value in points.values)],
+            )
             runs.append((replace(record, tags=tags, params=params), both))
     sweep = sweep_of(runs)
     for metric, family in ((None, 2), (names.EVAL_SUCCESS, 3)):
@@ -551,6 +556,38 @@ def test_the_answer_counts_runs_of_all_planned_stages(rng: np.random.Generator) 
     assert "31 of 32 runs finished. 1 failed run counts with the worst value" in said
     assert "80% power" in said
     assert "of a bound" not in said
+
+
+@pytest.mark.parametrize(
+    "p_value, text", [(0.0499, "p = 0.0499"), (0.0501, "p = 0.0501"), (0.05, "p = 0.05")]
+)
+def test_a_p_value_is_on_its_side_of_the_decision(p_value: float, text: str) -> None:
+    assert p_text(p_value) == text
+
+
+def test_small_differences_have_the_decimals_of_their_interval() -> None:
+    estimate = Estimate(value=np.array(0.0042), lower=np.array(0.0011), upper=np.array(0.0073))
+    assert (difference_text(estimate), interval_text(estimate)) == ("+0.004", "0.001 to 0.007")
+    wide = Estimate(value=np.array(-1523.4), lower=np.array(-2000.0), upper=np.array(-9.5))
+    assert (difference_text(wide), interval_text(wide)) == ("-1,523", "-2,000 to -10")
+
+
+def test_stages_with_and_without_a_search_are_compared_side_by_side(
+    rng: np.random.Generator,
+) -> None:
+    her = [run({"tac.entropic_index": "1"}, seed, 0.2, rng, stage="her") for seed in range(6)]
+    searched = [
+        run({"tac.entropic_index": "1", "tac.alpha": alpha}, seed, 0.4, rng, stage="tune", part=p)
+        for alpha, p, seeds in (("0.1", "trial0", range(2)), ("0.2", "final0", range(6)))
+        for seed in seeds
+    ]
+    text = "stage = tune better than stage = her"
+    sweep = sweep_of([*her, *searched], with_plan((), plan(text, stage="tune"), 5))
+    found = study_of(sweep)
+    assert [dict(mean.condition.others)["stage"] for mean in found.means] == ["her", "tune"]
+    # The figure of all stages shows the same runs.
+    (drawing, *_) = drawings_of_stages(sweep, find_stages(sweep))
+    assert len(drawing.legend) == 2
 
 
 def test_returns_that_all_diverged_are_named() -> None:

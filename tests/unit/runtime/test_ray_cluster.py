@@ -19,7 +19,7 @@ import ray
 
 from music_rllib.config.schema import Resources
 from music_rllib.runtime import ray_cluster
-from music_rllib.runtime.machine import ClusterError, own_folder, ray_parent
+from music_rllib.runtime.machine import ClusterError, check_cpus, own_folder, ray_parent
 from music_rllib.runtime.ray_cluster import WAITING, Capacity, _capacity, slots
 
 GIB = 2.0**30
@@ -181,6 +181,17 @@ def test_the_scarcest_resource_limits_the_number_of_runs(
 def test_a_run_that_can_never_fit_is_refused(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ClusterError, match=message):
         slots(Resources(**settings), [SMALL, BIG], local=False)
+
+
+def test_a_local_ray_has_the_cpus_of_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ray itself would count those that `taskset` or Slurm gives to others."""
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 128)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {*range(8)})
+    assert check_cpus(Resources()) == 8
+    assert check_cpus(Resources(num_cpus=2)) == 2
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {*range(128)})
+    assert check_cpus(Resources()) is None, "Ray counts a container's share"
 
 
 def test_one_node_must_have_all_resources_of_a_run() -> None:

@@ -53,6 +53,17 @@ def test_null_is_a_sqlite_file_in_the_storage(tmp_path: Path) -> None:
     assert "ui --backend-store-uri" in store.ui_command()
 
 
+def test_a_slurm_task_keeps_no_artifacts_in_the_storage(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its database is deleted when it ends."""
+    monkeypatch.setenv("MUSIC_RLLIB_STUDIES", str(tmp_path / "scratch"))
+    store = resolve_store(f"sqlite:///{tmp_path}/scratch/mlflow.db", str(tmp_path / "results"))
+    assert store.artifact_root == f"file://{tmp_path}/scratch/mlartifacts"
+    store = resolve_store("http://mlflow:5000", str(tmp_path / "results"))
+    assert store.artifact_root is None
+
+
 def test_a_relative_storage_is_made_absolute(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
