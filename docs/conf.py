@@ -61,7 +61,7 @@ adr/*
 ```
 ```{toctree}
 :hidden:
-:caption: What came out
+:caption: Results
 results
 results/plan
 lab/claims

@@ -91,7 +91,8 @@ stages:
 
 A setting can be written in several places. From the lowest to the highest priority they are: the
 variant, the `preset`, `defaults`, the stage, its `per_task` entry for the task, and the point of
-its `grid`. The groups `evaluation`, `tac`, `music` and `replay` are merged field by field.
+its `grid`. The groups `evaluation`, `tac`, `music`, `intrinsic` and `replay` are merged field by
+field.
 
 All problems of a file are reported at once, before anything starts, each with file, line, key, rule
 and value. Files follow YAML 1.2: `1e-3` is a number and `no` is text. `1e6` is accepted as an
@@ -255,7 +256,7 @@ def variants() -> str:
     sources = {
         "scratch": "nothing",
         "estimator": "the estimator",
-        "agent": "policy, critics, value, their averages, and the observation normaliser",
+        "agent": "policy, critics, value, their averages, and the observation normalizer",
         "intrinsic": "the networks and the scale of the intrinsic reward",
     }
     lines = ["| variant | fixes | takes over |", "|---|---|---|"]

@@ -14,8 +14,8 @@ gym.register_envs(gymnasium_robotics)
 policy = load_policy(sys.argv[1])
 env = gym.make(policy.task.env_id)
 observation, _ = env.reset(seed=0)
-total, truncated = 0.0, False
-while not truncated:
-    observation, reward, _, truncated, info = env.step(policy.act(observation))
-    total += reward
-print(f"return {total:g}, success {info['is_success']:g}")
+total, done = 0.0, False
+while not done:
+    observation, reward, terminated, truncated, info = env.step(policy.act(observation))
+    total, done = total + reward, terminated or truncated
+print(f"return {total:g}, success {info.get(policy.task.success_key)}")

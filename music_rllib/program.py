@@ -53,7 +53,7 @@ Examples:
   music-rllib report results/reach
   ray job submit --working-dir . -- \\
     python -m music_rllib.sweep reach.yaml --storage /data/results
-      as a job of a Ray cluster; without a command in front, a file is run
+      run the file as a job of a Ray cluster (`run` may be omitted)
 
 'music-rllib COMMAND --help' shows the arguments of a command, with examples.
 

@@ -57,6 +57,7 @@ WANTED = (
     names.TRAIN_DISPLACEMENT,
     names.ALPHA,
     names.MI_REWARD_WEIGHT,
+    names.INTRINSIC_WEIGHT,
 )
 """Metrics that a report reads."""
 MOST_PROCESSES = 8
@@ -238,7 +239,8 @@ def _has_diverged(sweep: Sweep, run: int) -> bool:
         return False
     if params.get("music.task_reward") == "False":
         low = high = 0.0
-    weight = at_steps(names.MI_REWARD_WEIGHT).max(initial=0.0)
+    weights = (names.MI_REWARD_WEIGHT, names.INTRINSIC_WEIGHT)
+    weight = sum(at_steps(name).max(initial=0.0) for name in weights)
     bonuses = at_steps(names.ALPHA) * at_steps(names.ENTROPY)
     return bool(have_diverged(means, bonuses, Range(low - weight, high), gamma).any())
 

@@ -309,32 +309,32 @@ def with_interval(value: float | None, ends: Sequence[float | None] | None) -> s
     low, high = ends or (None, None)
     if low is None or high is None or low != low or high != high:
         return number(value) if abs(value) >= 100 else f"{value:.3g}"
-    return "{} [{}, {}]".format(*_alike(value, low, high))
+    decimals = _decimals(value, low, high)
+    value, low, high = (round(one, decimals) + 0.0 for one in (value, low, high))
+    return f"{value:,.{decimals}f} [{low:,.{decimals}f}, {high:,.{decimals}f}]"
 
 
-def _alike(value: float, low: float, high: float) -> tuple[str, str, str]:
-    """The numbers of an estimate with the same decimals.
-
-    Two decimals, none from 100 on, and as many as a narrower interval needs.
-    """
+def _decimals(value: float, low: float, high: float) -> int:
+    """Two decimals, none from 100 on, and as many as a narrower interval needs."""
     decimals = 0 if max(abs(value), abs(low), abs(high)) >= 100 else 2
     if 0 < high - low < math.inf:
         decimals = max(decimals, -math.floor(math.log10(high - low)))
-    value, low, high = (round(one, decimals) + 0.0 for one in (value, low, high))
-    return f"{value:,.{decimals}f}", f"{low:,.{decimals}f}", f"{high:,.{decimals}f}"
+    return decimals
 
 
 def interval_text(estimate: Estimate) -> str:
     """`0.62 to 0.81`, or `no interval`."""
     if not estimate.has_interval:
         return "no interval"
-    return "{1} to {2}".format(*_alike(*estimate.numbers))
+    _, low, high = numbers = estimate.numbers
+    decimals = _decimals(*numbers)
+    return f"{low:,.{decimals}f} to {high:,.{decimals}f}"
 
 
 def difference_text(estimate: Estimate) -> str:
     """`+0.12`, with as many decimals as its interval."""
-    text = _alike(*estimate.numbers)[0]
-    return text if text.startswith("-") else f"+{text}"
+    value, *_ = numbers = estimate.numbers
+    return f"{value:+,.{_decimals(*numbers)}f}"
 
 
 def p_text(p_value: float) -> str:

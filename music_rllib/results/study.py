@@ -156,7 +156,9 @@ def study_of(
         if plan is None:
             rates = {measure.metric for measure in measures.values()}
             without_test = len(pairs) * _scopes(chosen.tasks, rates) - len(of_stage)
-    of_plan = [one for name, one in stages.items() if any(name in of for _, of in in_time)]
+    of_plan = [
+        one for name, one in stages.items() if any(name in of for _, of in (*in_time, *late))
+    ]
     compared = [run for one in filter(None, [chosen, *of_plan]) for run in _runs(one)]
     return Study(
         stage=chosen,

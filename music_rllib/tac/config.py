@@ -124,7 +124,9 @@ class TACConfigBase(AlgorithmConfig):
         surrounding_indices: Sequence[int] = NotProvided,
         **settings: Any,
     ) -> Self:
-        """Switch on MUSIC's intrinsic reward and set its hyperparameters.
+        """Set the hyperparameters of MUSIC's intrinsic reward.
+
+        `estimator="trained"` and `mi_reward_weight` > 0 add the reward.
 
         Args:
             agent_indices: positions of the agent's state in the observation.

@@ -78,8 +78,8 @@ Seeds = Annotated[
     str | None,
     typer.Option(
         metavar="N",
-        help="Number of seeds (the first N of the file) or a list such as 0,1,7. Finished seeds "
-        "are reused.",
+        help="Number of seeds (those of the file first, then the smallest others) or a list such "
+        "as 0,1,7. Finished seeds are reused.",
     ),
 ]
 AcceptChanges = Annotated[

@@ -63,7 +63,7 @@ def slurm(
     ] = None,
     submit: Annotated[bool, typer.Option("--submit", help="Also submit the script.")] = False,
 ) -> int:
-    """Write a batch script that runs a sweep as a Slurm job array, and submit it.
+    """Write a batch script that runs a sweep as a Slurm job array; --submit submits it.
 
     The tasks are drivers that share the runs of the sweep through the storage, a folder that all
     nodes mount or a bucket. A second job after the array logs all runs to MLflow and writes the

@@ -146,13 +146,17 @@ def test_runs_without_a_seed_and_with_an_infinite_return_are_reported() -> None:
 
 
 def test_runs_with_diverged_critics_are_listed() -> None:
-    """With the MI reward, a step has a reward of at least -1.5: -60 is too low at gamma 0.95."""
+    """With an intrinsic reward, a step has at least -1.5: -60 is too low at gamma 0.95."""
     known = {"task.reward_range": "[-1.0, 0.0]", "tac.gamma": "0.95"}
 
     def run(
-        seed: int, critics: float, params: Mapping[str, str], weight: float = 0.5
+        seed: int,
+        critics: float,
+        params: Mapping[str, str],
+        weight: float = 0.5,
+        of: str = names.MI_REWARD_WEIGHT,
     ) -> tuple[RunRecord, Points]:
-        logged = [(names.Q_MEAN, critics), (names.MI_REWARD_WEIGHT, weight)]
+        logged = [(names.Q_MEAN, critics), (of, weight)]
         metrics = [name for name, _ in logged for _ in range(2)]
         values = [part * value for _, value in logged for part in (1.0, 0.5)]
         points = Points(metrics, [1000, 2000] * 2, [1, 2] * 2, values)
@@ -166,12 +170,13 @@ def test_runs_with_diverged_critics_are_listed() -> None:
                 run(2, -61.0, known | {"task.reward_range": "None"}),
                 run(3, -41.0, known, 0.0),
                 run(4, -41.0, known | {"music.task_reward": "False"}),
+                run(5, -59.0, known, of=names.INTRINSIC_WEIGHT),
             ]
         )
     )
     (said,) = [line for line in report.limitations if "critics" in line]
     assert said.startswith("The critics of 3 runs diverged, to values that no reward explains")
-    assert [f"seed{seed}" in said for seed in range(5)] == [False, True, False, True, True]
+    assert [f"seed{seed}" in said for seed in range(6)] == [False, True, False, True, True, False]
 
 
 LOW, HIGH = [0.3, 0.32, 0.35, 0.31, 0.3], [0.9, 0.92, 0.88, 0.95, 0.9]
