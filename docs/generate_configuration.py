@@ -112,8 +112,9 @@ music-rllib plan my_sweep.yaml stages.finetune.grid.tac.entropic_index='[1, 1.25
 
 A setting (`tac.alpha`, `env_steps`) replaces the values in `defaults`, in all stages and under
 `per_task`. `stages.NAME.KEY` changes one stage. A top-level key (`seeds`) replaces the value in the
-file. A setting that a `grid` or `search` varies can only be replaced there. The sweep's folder
-contains the complete configuration (`config.json`), which `resume` uses.
+file: `seeds=3` means 0, 1 and 2, while `--seeds 3` takes the file's seeds first. A setting that a
+`grid` or `search` varies can only be replaced there. The sweep's folder contains the complete
+configuration (`config.json`), which `resume` uses.
 """
 
 SEARCH_TEXT = """\
@@ -126,7 +127,9 @@ which kind of search answers which question.
 VARIANTS_TEXT = """\
 ## Variants
 
-`variant` fixes some settings of `music`; other values are errors. The networks that it takes over
+`variant` fixes some settings of `music`; other values are errors. A setting without effect in a
+variant (such as `music.lr` in MUSIC-r) is an error in a stage, and ignored in `defaults` and
+presets. The networks that it takes over
 come from the run that `init_from` names. `intrinsic-u` and `intrinsic-r` are the counterparts of
 MUSIC-u and MUSIC-r for `intrinsic.reward`, which every other variant can have too. The default of
 `music.mi_reward_weight` is 1 for MUSIC-u and the task's `mi_reward_weight` for MUSIC-r.

@@ -245,7 +245,8 @@ class InitFrom(StrictModel):
     """`init_from` of a stage as it is written."""
 
     stage: str | None = None
-    """An earlier stage; a run starts from that stage's run with the same seed."""
+    """An earlier stage without a search. A run starts from that stage's run with the same seed; if
+    that stage has a grid, each of its trials is combined with each point of this one's."""
     checkpoint: str | None = None
     """Instead of a stage: local folder of a handoff from outside the sweep, exported by `best` or
     of a finished run (`STORAGE/nodes/KEY`). It is copied into the storage: later commands do not
