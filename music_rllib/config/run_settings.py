@@ -137,10 +137,6 @@ YOUNGER: tuple[tuple[str, str], ...] = (
 """Group and name of settings that are newer than the node keys of finished runs."""
 
 
-def _sorted(names: tuple[str, ...]) -> tuple[str, ...]:
-    return tuple(sorted(set(names)))
-
-
 class ReplaySettings(StrictModel):
     """Size of the replay, and hindsight relabeling (Andrychowicz et al. 2017)."""
 
