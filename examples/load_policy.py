@@ -18,4 +18,5 @@ total, done = 0.0, False
 while not done:
     observation, reward, terminated, truncated, info = env.step(policy.act(observation))
     total, done = total + reward, terminated or truncated
-print(f"return {total:g}, success {info.get(policy.task.success_key)}")
+success = float(info.get(policy.task.success_key, "nan"))
+print(f"return {total:g}, success {success:g}")

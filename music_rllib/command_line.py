@@ -51,11 +51,15 @@ def called_as() -> list[str]:
     return ["python", "-m", spec.parent]
 
 
-def how_to_continue() -> str:
-    """The message of a stopped sweep: what is kept, and the command that continues it."""
+def how_to_continue(*, has_begun: bool = True) -> str:
+    """The message of a stopped sweep: what is kept, and the command that continues it.
+
+    Before a sweep `has_begun`, what it is to retrain may not be recorded yet.
+    """
     from music_rllib.redaction import redact
 
-    command = redact(shlex.join([*called_as(), *_without_retrain(sys.argv[1:])]))
+    arguments = _without_retrain(sys.argv[1:]) if has_begun else sys.argv[1:]
+    command = redact(shlex.join([*called_as(), *arguments]))
     return f"Stopped. Finished runs and the last checkpoints are kept; continue with: {command}"
 
 

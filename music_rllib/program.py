@@ -57,9 +57,9 @@ Examples:
 
 'music-rllib COMMAND --help' shows the arguments of a command, with examples.
 
-Exit codes: 0 success; 1 a run failed or Ray died, the state is kept; 2 bad
-input or damaged results, nothing was started; 130 stopped by Ctrl-C, 143 by
-SIGTERM.
+Exit codes: 0 success; 1 a run failed, or Ray or the storage died, the state
+is kept; 2 bad input or damaged results, nothing was started; 130 stopped by
+Ctrl-C, 143 by SIGTERM.
 """
 
 

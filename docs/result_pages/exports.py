@@ -96,7 +96,7 @@ def of_plan(plan: Plan, exports: Iterable[Sweep], *earlier: Plan) -> Sweep | Non
         None if no export has any of the runs.
     """
     exports = list(exports)
-    best = best_records(exports)
+    best = best_records(one.having(lambda run: run.status != "SCHEDULED") for one in exports)
     versions = (plan, *earlier)
     found: list[tuple[Plan, Node]] = []
     sources: set[str | None] = set()

@@ -65,7 +65,11 @@ def _first(passage: tuple[float, bool] | None) -> str:
 
 def provenance(sweep: Sweep) -> str:
     """Commits, versions and evaluation episodes of the runs."""
-    commits = all_of(run.tags.get(names.TAG_GIT_COMMIT, "")[:7] for run in sweep.runs)
+    commits = all_of(
+        run.tags.get(names.TAG_GIT_COMMIT, "")[:7]
+        for run in sweep.runs
+        if run.status != "SCHEDULED"
+    )
     versions = sorted(
         {
             f"{tag.removeprefix(names.TAG_VERSION_PREFIX)} {value}"

@@ -149,7 +149,11 @@ def _export(
             f"{folder}: it has {earlier.name!r}, not {sweep.name!r}"
         )
     if add and earlier is not None:
-        sweep = merged(earlier.having(partial(_is_kept, sweep)), sweep)
+        kept = earlier.having(partial(_is_kept, sweep))
+        names_kept = {run.name for run in kept.runs}
+        # A run of an earlier version of the algorithm stays instead of its waiting successor.
+        own = sweep.having(lambda run: run.status != "SCHEDULED" or run.name not in names_kept)
+        sweep = merged(kept, own)
     write_archive(sweep, folder, table_format.value)
     if sweep.earlier:
         typer.echo(sweep.earlier)
@@ -160,13 +164,14 @@ def _export(
 def _is_kept(sweep: Sweep, run: RunRecord) -> bool:
     """Whether a run of an earlier export stays: unless the sweep has it with other settings.
 
-    A run of an earlier version of the algorithm stays until the sweep has finished its own.
+    The sweep has its own waiting runs. A run of an earlier version of the algorithm stays until the
+    sweep has finished its own.
     """
     own = next((one for one in sweep.runs if one.name == run.name), run)
     replaced = own.is_finished or own.tags.get(names.TAG_ALGORITHM) == run.tags.get(
         names.TAG_ALGORITHM
     )
-    return own.node_key == run.node_key or not replaced
+    return run.status != "SCHEDULED" and (own.node_key == run.node_key or not replaced)
 
 
 def _report(

@@ -106,7 +106,7 @@ def render(report: SweepReport, *, live: bool = False) -> str:
     # The verdicts are in large letters; the metric, seeds and control follow in small ones.
     details = (i for i, line in enumerate(sentences) if line.startswith("Metric:"))
     claims = next(details, len(sentences))
-    planned = planned_in_words(report.study)
+    planned = [] if report.differences else [_as_sentence(planned_in_words(report.study))]
     page = _PAGES.get_template("page.html").render(
         style=(folder / "page.css").read_text(encoding="utf-8"),
         script=script,
@@ -119,7 +119,7 @@ def render(report: SweepReport, *, live: bool = False) -> str:
         limitations=report.limitations,
         question=_question(report),
         answer=sentences[:claims],
-        details=[*sentences[claims:], f"{planned[0].upper()}{planned[1:]}."] if sentences else [],
+        details=[*sentences[claims:], *planned] if sentences else [],
         numbers=numbers,
         pictures={drawing.name: inline(drawing) for drawing in report.drawings},
         large=_large_figure(report, list(numbers)),
@@ -137,6 +137,10 @@ def render(report: SweepReport, *, live: bool = False) -> str:
         marks=_MARKS,
     )
     return page.strip() + "\n"
+
+
+def _as_sentence(text: str) -> str:
+    return f"{text[0].upper()}{text[1:]}."
 
 
 def _facts(report: SweepReport) -> Sequence[tuple[str, object]]:

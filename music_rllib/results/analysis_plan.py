@@ -1,10 +1,10 @@
 """Analysis plans: a question and how it will be decided, recorded before the runs.
 
 Every version is kept in `analysis_plan.json` with the time at which it was recorded, so that a
-report can tell planned comparisons from others: a plan that was recorded after the first of its
-runs had finished does not count. `analysis_plan.md` has the same content for readers. The hash is
-that of the plan alone: the same `analysis` section has the same hash on every machine, and can be
-cited or committed before anything runs.
+report can tell planned comparisons from others: a hypothesis counts as planned if the last version
+before the first result of its stages has it. `analysis_plan.md` has the same content for readers.
+The hash is that of the plan alone: the same `analysis` section has the same hash on every machine,
+and can be cited or committed before anything runs.
 
 Texts of a plan are part of its hash, so existing ones must not change.
 """
@@ -86,6 +86,11 @@ class AnalysisPlan(_Strict):
     def stages_of_hypotheses(self) -> dict[str, frozenset[str]]:
         """The stages that each hypothesis compares."""
         return {text: _stages_of([text], self.stage) for text in self.hypotheses}
+
+    def seeds_of(self, stage: str) -> str:
+        """The seeds of a stage in words."""
+        parts = re.split(r"; (?=[^;:]+: )", self.seeds)
+        return dict(part.split(": ", 1) for part in parts if ": " in part).get(stage, self.seeds)
 
     @property
     def seed_count(self) -> int:

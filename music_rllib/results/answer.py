@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -38,7 +38,7 @@ def answer(sweep: Sweep, study: Study) -> list[str]:
     sentences = [f"{planned[0].upper()}{planned[1:]}."]
     if study.question is not None:
         sentences = [f"Question: {study.question} ({planned})."]
-    if not study.claims and (reason := _without_result(sweep, study)):
+    if reason := _without_result(sweep, study):
         return [*sentences, reason]
     shown = [claim for claim in study.claims if claim.task == ALL_TASKS] or list(study.claims)
     sentences += [f"{claim_in_words(claim)}." for claim in shown[:MOST_CLAIMS]]
@@ -68,10 +68,13 @@ def answer(sweep: Sweep, study: Study) -> list[str]:
 
 def _without_result(sweep: Sweep, study: Study) -> str | None:
     """Why there is nothing to compare; None if a run has a result."""
-    if study.stage is None and any(run.status != "SCHEDULED" for run in sweep.runs):
-        return "No stage trains for the task: no comparison."
     if any(mean.scores.finished for mean in study.means):
         return None
+    results = (sweep.runs[i].is_finished and not has_failed(sweep, i) for i in study.runs)
+    if study.claims and any(results):
+        return None
+    if study.stage is None and any(run.status != "SCHEDULED" for run in sweep.runs):
+        return "No stage trains for the task: no comparison."
     if study.runs and all(sweep.runs[run].status in ("FINISHED", "FAILED") for run in study.runs):
         return f"No run has a result: {len(study.runs)} failed or diverged."
     if study.stage is not None and study.stage.is_search:
@@ -89,14 +92,19 @@ def planned_in_words(study: Study) -> str:
             f"planned {plan.recorded}, before {first} finished; version {plan.version}, "
             f"hash {plan.hash[:12]}"
         )
-        for number, count in Counter(one.version for one in study.before).items():
+        for number, count in Counter(one.version for one in study.before.values()).items():
             text += f"; {count} already in version {number}"
         if study.late:
             text += f"; not planned, because runs of it had finished: {', '.join(study.late)}"
         if study.dropped:
             text += f"; dropped after results: {', '.join(study.dropped)}"
-        changed = [] if latest is None else _changed(plan.plan, latest.plan)
-        return f"{text}; changed afterwards: {', '.join(changed)}" if changed else text
+        changed: list[str] = []
+        if latest is not None:
+            changed += _changed(plan.plan, latest.plan)
+            for hypothesis, one in study.before.items():
+                changed += _changed_tests(hypothesis, one.plan, latest.plan)
+        names_of_fields = ", ".join(dict.fromkeys(changed))
+        return f"{text}; changed afterwards: {names_of_fields}" if changed else text
     if latest is not None:
         return f"recorded {latest.recorded}, after the first run had finished: not planned"
     return "no comparison was planned in advance: all pairs of conditions are compared"
@@ -106,6 +114,17 @@ def _changed(before: AnalysisPlan, after: AnalysisPlan) -> list[str]:
     """Fields that a later version of a plan has changed, such as the seeds."""
     known, now = before.model_dump(), after.model_dump()
     return [name.replace("_", " ") for name in known if known[name] != now[name]]
+
+
+def _changed_tests(hypothesis: str, before: AnalysisPlan, after: AnalysisPlan) -> Iterator[str]:
+    """What a later version changes in the test of a hypothesis; further stages change nothing."""
+    if any(
+        before.seeds_of(s) != after.seeds_of(s) for s in before.stages_of_hypotheses[hypothesis]
+    ):
+        yield "seeds"
+    yield from (
+        name for name in ("metric", "margin") if getattr(before, name) != getattr(after, name)
+    )
 
 
 def claim_in_words(claim: Claim) -> str:

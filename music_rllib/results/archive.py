@@ -384,11 +384,18 @@ def plan_versions(sweeps: Iterable[Sweep]) -> tuple[PlanVersion, ...]:
 
 
 def best_records(sweeps: Iterable[Sweep]) -> dict[str, Place]:
-    """The last finished run of each node key, else the last one, in order of first appearance."""
+    """The last finished run of each node key, else the last that began, else the last one.
+
+    Keys are in the order of their first appearance.
+    """
     best: dict[str, Place] = {}
     for sweep in sweeps:
         for position, run in enumerate(sweep.runs):
             other, at = best.get(run.node_key, (sweep, position))
-            if run.is_finished or not other.runs[at].is_finished:
+            if _rank(run) >= _rank(other.runs[at]):
                 best[run.node_key] = (sweep, position)
     return best
+
+
+def _rank(run: RunRecord) -> int:
+    return 2 if run.is_finished else int(run.status != "SCHEDULED")

@@ -59,8 +59,8 @@ class Study:
     """None before a run has started, and without a stage that trains for the task."""
     plan: PlanVersion | None
     """The last version that planned a hypothesis in time; None without one."""
-    before: tuple[PlanVersion, ...]
-    """For each hypothesis that an earlier version planned in time: this version."""
+    before: Mapping[str, PlanVersion]
+    """Hypotheses that an earlier version planned in time, and this version."""
     latest: PlanVersion | None
     means: tuple[Mean, ...]
     planned: tuple[Claim, ...]
@@ -163,13 +163,13 @@ def study_of(
     return Study(
         stage=chosen,
         plan=plan,
-        before=tuple(one for one in in_time.values() if one is not plan),
+        before={text: one for (text, _), one in in_time.items() if one is not plan},
         latest=latest,
         means=tuple(means),
         late=tuple(text for text, _ in late),
         dropped=tuple(
-            text
-            for text, of in in_time
+            _in_full(text, one, latest).text
+            for (text, of), one in in_time.items()
             if latest is not None and (text, of) not in latest.plan.stages_of_hypotheses.items()
         ),
         planned=decided(planned, planned=True, without_test=without_test),
@@ -229,28 +229,41 @@ def _of_plan(
     plan = version.plan
     sweep = counted(sweep, plan.metric) if hypotheses else sweep
     for text, of in hypotheses:
-        hypothesis = Hypothesis.of(text)
+        hypothesis = _in_full(text, version, sweep.plans[-1])
         tasks = _tasks_of_all(sweep, of, plan.budget.keys())
         scopes = _scopes(tasks, {sweep.primary_metric(task) for task in tasks})
         sides = (hypothesis.first, hypothesis.second)
         first, second = (_matching(sweep, stages, side, plan.stage) for side in sides)
         pairs = _equal_in_the_rest(first, second, hypothesis)
         if isinstance(pairs, str):
-            untested[f"{text}: {pairs}"] = scopes
+            untested[f"{hypothesis.text}: {pairs}"] = scopes
             continue
         runs = [run for pair in pairs for condition in pair for run in condition.runs]
         measures = {
             task: measure_on(sweep, task, runs, plan.metric, horizon=plan.budget.get(task, np.inf))
             for task in dict.fromkeys(sweep.runs[run].task for run in runs)
+            if task in tasks
         }
         labelled = (_in_words(hypothesis.first), _in_words(hypothesis.second), pairs)
         claims = list(claims_of(sweep, [labelled], measures, plan.margin, plan.seed_count))
         if len(claims) < scopes:
             left = sorted(tasks - {claim.task for claim in claims})
-            where = f" on {', '.join(left)}" if claims else ""
+            where = f" on {', '.join(left)}" if left else " over all tasks"
             reason = "no seed has finished in both conditions"
-            untested[f"{text}{where}: {reason}"] = scopes - len(claims)
+            untested[f"{hypothesis.text}{where if claims else ''}: {reason}"] = scopes - len(claims)
         yield from (replace(claim, hypothesis=hypothesis) for claim in claims)
+
+
+def _in_full(text: str, version: PlanVersion, latest: PlanVersion | None) -> Hypothesis:
+    """The hypothesis, with the default stage of its version if a later one has another."""
+    hypothesis, stage = Hypothesis.of(text), version.plan.stage
+    if latest is None or stage == latest.plan.stage:
+        return hypothesis
+    sides = [
+        ", ".join(f"{k} = {v}" for k, v in {"stage": stage, **side}.items())
+        for side in hypothesis.sides
+    ]
+    return Hypothesis.of(f"{sides[0]} {hypothesis.relation} {sides[1]}")
 
 
 def _tasks_of_all(sweep: Sweep, stages: Collection[str], planned: Set[str]) -> Set[str]:

@@ -152,9 +152,7 @@ def _is_left_by_ray(folder: Path) -> bool:
 
 
 def check_cpus(resources: Resources) -> int | None:
-    """Number of CPUs for a local Ray; None if Ray counts them, or with a cluster.
-
-    Ray counts those of a container, but not those of `taskset` or of a job of Slurm.
+    """Number of CPUs for a local Ray; None if all are for it, or with a cluster.
 
     Raises:
         ClusterError: This machine has fewer CPUs than `resources` asks for.
@@ -168,8 +166,7 @@ def check_cpus(resources: Resources) -> int | None:
             raise ClusterError(
                 f"resources.{name} must be <= {here}, the CPUs of this machine, got {asked}"
             )
-    limited = here if here < (os.cpu_count() or here) else None
-    return resources.num_cpus or limited
+    return resources.num_cpus
 
 
 def check_memory_and_gpus(resources: Resources) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 
 import psutil
 import ray
+from ray._private.utils import get_num_cpus
 
 from music_rllib.config.schema import Resources
 from music_rllib.envs.tasks import folders_for_workers, search_in
@@ -156,7 +157,7 @@ def cluster(
             hold a run and no autoscaler adds nodes.
     """
     start_ray(
-        num_cpus=check_cpus(resources),
+        num_cpus=check_cpus(resources) or _cpus_here(),
         object_store_memory=OBJECT_STORE_BYTES,
         _memory=free_memory(),
     )
@@ -164,6 +165,17 @@ def cluster(
         yield _wait_for_nodes(resources, wait_minutes, say)
     finally:
         stop_ray()
+
+
+def _cpus_here() -> int | None:
+    """CPUs of this process; None with a cluster.
+
+    Ray itself counts the share of a container, and not that of `taskset` or of a job of Slurm.
+    """
+    if cluster_address() is not None:
+        return None
+    share = int(get_num_cpus(override_docker_cpu_warning=True))
+    return max(1, min(len(os.sched_getaffinity(0)), share))
 
 
 def _wait_for_nodes(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,7 +17,13 @@ from music_rllib.redaction import redact
 from music_rllib.store.lease import Lease, LeaseFile
 from music_rllib.store.node_store import CONTINUATIONS
 from music_rllib.store.sealed import MANIFEST
-from music_rllib.store.storage import StorageFolder, is_remote, open_storage, sweep_folder
+from music_rllib.store.storage import (
+    StorageError,
+    StorageFolder,
+    is_remote,
+    open_storage,
+    sweep_folder,
+)
 from music_rllib.store.work_folder import WorkFolder
 from music_rllib.sweep.driver_lock import drivers_of
 
@@ -166,13 +173,15 @@ def check_not_in_use(location: SweepLocation, keys: Collection[str]) -> None:
     Raises:
         BadInputError: A running sweep has one.
     """
-    for other in sweeps_in(location.storage) if keys else ():
-        shared = [node["label"] for node in _nodes(other) if node["key"] in keys]
-        is_other = other.name != location.name
-        if is_other and shared and _is_driven(other, other.read(sweep_files.STATE)):
+    others = [one for one in sweeps_in(location.storage) if keys and one.name != location.name]
+    for other in others:
+        shared = []
+        with contextlib.suppress(StorageError):  # no driver runs a sweep with a damaged plan
+            shared = [node["label"] for node in _nodes(other) if node["key"] in keys]
+        if shared and _is_driven(other, other.read(sweep_files.STATE)):
             raise BadInputError(
-                f"--retrain must name no runs of a running sweep, {other.name} uses {shared[0]}: "
-                "stop it first"
+                "--retrain and --accept-changes must delete no runs of another running sweep, "
+                f"{other.name} uses {shared[0]}: stop it first"
             )
 
 

@@ -256,7 +256,11 @@ def _record_analysis_plan(console: Console, opened: OpenSweep) -> list[dict[str,
         recorded = f"version {last.version} recorded {last.recorded}, hash {last.hash[:12]}"
         _say(console, f"Analysis plan: {place}, {recorded}")
     if late:
-        _say(console, f"Not planned, because runs of it have finished: {'; '.join(late)}", "yellow")
+        _say(
+            console,
+            f"Not planned by this version, because runs of it have finished: {'; '.join(late)}",
+            "yellow",
+        )
     return as_document(versions)
 
 
@@ -282,7 +286,7 @@ def _stopped_early(console: Console, stopped: KeyboardInterrupt | SystemExit) ->
         number = signal.SIGTERM
     else:
         raise stopped
-    _say(console, how_to_continue())
+    _say(console, how_to_continue(has_begun=False))
     return 128 + number
 
 

@@ -13,6 +13,7 @@ import logging
 import os
 import shlex
 import shutil
+import signal
 import uuid
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -247,7 +248,9 @@ class Tracker:
         if kind is None:
             self.close("FINISHED")
         else:
-            self.close("FAILED" if issubclass(kind, Exception) else "KILLED")
+            terminated = isinstance(error, SystemExit) and error.code == signal.SIGTERM
+            is_stopped = kind is KeyboardInterrupt or terminated
+            self.close("KILLED" if is_stopped else "FAILED")
 
     def _parent_run(self, config: Mapping[str, object]) -> RunQueue:
         """The parent run. It is created at once, as its children need its id."""

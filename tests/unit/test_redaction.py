@@ -308,3 +308,4 @@ def test_the_command_that_continues_a_sweep_deletes_no_results(
     options = ["--retrain", "FetchPush", "--keep-runs", "--retrain=her", "--retrain-damaged"]
     monkeypatch.setattr(sys, "argv", ["music-rllib", "run", "my.yaml", *options, "seeds=5"])
     assert how_to_continue().endswith("run my.yaml --keep-runs --retrain-damaged seeds=5")
+    assert "--retrain FetchPush" in how_to_continue(has_begun=False)

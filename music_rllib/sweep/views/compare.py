@@ -63,7 +63,8 @@ def compare_stage(
     final = analyse_stage(sweep, study.stage, shown) if study.stage else None
     if final is None or not any(scope.finals for scope in final.scopes):
         text = f"Stage {settings.name} of {sweep.name} has no finished run yet."
-        return document, Group(Text(text), *earlier)
+        planned = map(Text, document["answer"] if study.claims else ())
+        return document, Group(*planned, Text(text), *earlier)
     lines: list[RenderableType] = [*map(Text, document["answer"]), *earlier, Text()]
     lines += [Text(line, style="yellow") for line in environments]
     if final.stage.compared != final.stage.conditions:

@@ -249,7 +249,7 @@ def test_a_plan_that_changes_after_a_result_keeps_its_planned_claims(
     assert "changed afterwards: hypotheses, margin)" in answer(sweep_of(runs, both), found)[0]
 
 
-def test_a_hypothesis_is_planned_by_the_first_version_that_has_it(
+def test_a_hypothesis_is_planned_by_the_last_version_before_its_result(
     rng: np.random.Generator,
 ) -> None:
     """A stage and a hypothesis about it are added when an earlier stage has finished."""
@@ -281,8 +281,10 @@ def test_a_hypothesis_is_planned_by_the_first_version_that_has_it(
     texts, said = planned(old, new, "q = 1.5 better than q = 1")
     assert (texts, "q = 1.5 better than q = 1" in said) == ([old, new], True)
     texts, said = planned(old, new, margin=0.1)
-    assert texts == [old, new]
-    assert planned(old, new, seeds="0, 1")[0] == [old, new]
+    assert (texts, said[-28:]) == ([old, new], "changed afterwards: margin).")
+    texts, said = planned(old, new, seeds="0, 1")
+    assert (texts, said[-27:]) == ([old, new], "changed afterwards: seeds).")
+    assert "changed" not in planned(old, new, seeds="train: ; tune: 0, 1")[1]
     # A hypothesis that is left out after its result is still tested.
     texts, said = planned(new)
     assert texts == [old, new]
@@ -299,7 +301,12 @@ def test_a_plan_grows_by_a_stage_that_becomes_the_default(rng: np.random.Generat
     both = with_plan(first, plan(of_tune, stage="tune", seeds="train: 0, 1; tune: 8"), DONE + 1)
     found = study_of(sweep_of(train, both))
     (claim,) = found.planned
-    assert (claim.verdict, found.dropped) == (Verdict.SUPERIOR, (of_tune,))
+    # The label has the stage, because the last version means another one.
+    assert (claim.verdict, found.dropped) == (
+        Verdict.SUPERIOR,
+        ("stage = train, tac.entropic_index = 1.5 against stage = train, tac.entropic_index = 1",),
+    )
+    assert (claim.first, found.family) == ("stage = train, q = 1.5", 2)
     # Also if both name their stages, and if nothing of the new stage has a result.
     first = with_plan((), plan(of_train), DONE - 1)
     grown = with_plan(first, plan(of_train, of_tune, stage="tune"), DONE + 1)
@@ -539,6 +546,19 @@ def test_a_hypothesis_is_about_the_tasks_of_both_stages(rng: np.random.Generator
     versions = with_plan((), plan(text, stage="her", budget=budget), 5)
     found = study_of(sweep_of(runs, versions))
     assert (found.family, found.untested) == (1, ())
+    # Over two common tasks, there is a comparison over both.
+    more = [
+        run({"tac.entropic_index": "1"}, seed, height, rng, task=task, stage=stage)
+        for stage, task, height in (
+            ("music", "FetchSlide", 0.4),
+            ("her", "FetchPickAndPlace", 0.2),
+        )
+        for seed in range(6)
+    ]
+    budget["FetchPickAndPlace"] = BUDGET
+    versions = with_plan((), plan(text, stage="her", budget=budget), 5)
+    found = study_of(sweep_of([*runs, *more], versions))
+    assert (found.family, len(found.planned), found.untested) == (3, 3, ())
 
 
 def test_the_answer_counts_runs_of_all_planned_stages(rng: np.random.Generator) -> None:
@@ -588,6 +608,12 @@ def test_stages_with_and_without_a_search_are_compared_side_by_side(
     # The figure of all stages shows the same runs.
     (drawing, *_) = drawings_of_stages(sweep, find_stages(sweep))
     assert len(drawing.legend) == 2
+
+
+def test_runs_that_all_failed_have_no_result(rng: np.random.Generator) -> None:
+    runs = study({"1": 0.3, "1.5": 0.3}, 8, rng)
+    sweep = sweep_of([(replace(one, status="FAILED"), points) for one, points in runs], BEFORE)
+    assert answer(sweep, study_of(sweep))[1:] == ["No run has a result: 16 failed or diverged."]
 
 
 def test_returns_that_all_diverged_are_named() -> None:

@@ -19,7 +19,7 @@ import ray
 
 from music_rllib.config.schema import Resources
 from music_rllib.runtime import ray_cluster
-from music_rllib.runtime.machine import ClusterError, check_cpus, own_folder, ray_parent
+from music_rllib.runtime.machine import ClusterError, own_folder, ray_parent
 from music_rllib.runtime.ray_cluster import WAITING, Capacity, _capacity, slots
 
 GIB = 2.0**30
@@ -186,12 +186,15 @@ def test_a_run_that_can_never_fit_is_refused(settings: dict[str, Any], message: 
 def test_a_local_ray_has_the_cpus_of_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ray itself would count those that `taskset` or Slurm gives to others."""
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
-    monkeypatch.setattr(os, "cpu_count", lambda: 128)
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {*range(8)})
-    assert check_cpus(Resources()) == 8
-    assert check_cpus(Resources(num_cpus=2)) == 2
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {*range(128)})
-    assert check_cpus(Resources()) is None, "Ray counts a container's share"
+    started: list[int] = []
+    monkeypatch.setattr(ray_cluster, "start_ray", lambda num_cpus, **_: started.append(num_cpus))
+    monkeypatch.setattr(ray_cluster, "_wait_for_nodes", lambda *_: None)
+    for affinity, share, asked in ((8, 128, None), (128, 2, None), (8, 128, 2)):
+        monkeypatch.setattr(os, "sched_getaffinity", lambda _, count=affinity: {*range(count)})
+        monkeypatch.setattr(ray_cluster, "get_num_cpus", lambda count=share, **_: count)
+        with ray_cluster.cluster(Resources(num_cpus=asked)):
+            pass
+    assert started == [8, 2, 2]
 
 
 def test_one_node_must_have_all_resources_of_a_run() -> None:

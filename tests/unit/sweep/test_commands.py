@@ -867,7 +867,9 @@ def test_plan_names_hypotheses_about_finished_runs_when_it_records_them(
     planned = tmp_path / "planned.yaml"
     analysis = {"hypotheses": ["q = 1.5 better than q = 1"]}
     planned.write_text(yaml.safe_dump({**SWEEP, "storage": storage, "analysis": analysis}))
-    message = "Not planned, because runs of it have finished: q = 1.5 better than q = 1"
+    message = (
+        "Not planned by this version, because runs of it have finished: q = 1.5 better than q = 1"
+    )
     assert message in in_one_line(program("plan", str(planned)).output)
     assert "Not planned" not in program("plan", str(planned)).output  # recorded before
 
