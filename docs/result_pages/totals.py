@@ -15,7 +15,7 @@ from music_rllib.results.analysis_plan import MARGIN_OF_A_RATE
 from music_rllib.results.answer import not_excluded, numbers_in_words, verdict_in_words
 from music_rllib.results.claims import Claim, contrast, exploratory
 from music_rllib.results.conditions import Condition, find_stages
-from music_rllib.results.data import Sweep
+from music_rllib.results.data import RunRecord, Sweep
 from music_rllib.results.scores import Measure, area_under_curve, with_pretraining
 from music_rllib.results.study import study_of
 
@@ -97,10 +97,16 @@ def totals_table(sweep: Sweep, first: str, second: str) -> Iterator[str]:
                     )
 
 
+def _seconds(sweep: Sweep, run: RunRecord) -> float:
+    """Training time of a run and of those that it starts from."""
+    source = next((one for one in sweep.runs if one.node_key == run.source), None)
+    return (run.seconds or 0.0) + (_seconds(sweep, source) if source else 0.0)
+
+
 def arms_table(sweep: Sweep) -> Iterator[str]:
     """One row per stage of a plan that compares stages with one of them; the progress until then.
 
-    Times are those of the runs themselves, without the pretraining that several runs share.
+    Times include the pretraining, which several runs share.
     """
     study = study_of(sweep)
     if study.stage is None or not is_complete(sweep):
@@ -114,7 +120,7 @@ def arms_table(sweep: Sweep) -> Iterator[str]:
     }
     yield row(
         "stage", "verdict, difference", "area over all steps [95% CI]", "success at the end",
-        "minutes per run", "seeds",
+        "core-minutes", "seeds",
     )  # fmt: skip
     yield rule(6)
     for mean in study.means:
@@ -124,7 +130,7 @@ def arms_table(sweep: Sweep) -> Iterator[str]:
         if claim:
             numbers = numbers_in_words(claim)
             against = f"**{verdict_in_words(claim)}**, {numbers}{not_excluded(claim)}"
-        minutes = np.mean([sweep.runs[run].seconds or 0.0 for run in mean.condition.runs]) / 60
+        minutes = np.mean([_seconds(sweep, sweep.runs[run]) for run in mean.condition.runs]) / 60
         yield row(
             name, against, spread(mean.estimate), rate_cells(finals[mean.condition])[0],
             f"{minutes:.1f}", len(mean.scores.by_seed),
