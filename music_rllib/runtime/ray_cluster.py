@@ -157,7 +157,7 @@ def cluster(
             hold a run and no autoscaler adds nodes.
     """
     start_ray(
-        num_cpus=check_cpus(resources) or _cpus_here(),
+        num_cpus=check_cpus(resources) or (None if cluster_address() else cpus_here()),
         object_store_memory=OBJECT_STORE_BYTES,
         _memory=free_memory(),
     )
@@ -167,13 +167,11 @@ def cluster(
         stop_ray()
 
 
-def _cpus_here() -> int | None:
-    """CPUs of this process; None with a cluster.
+def cpus_here() -> int:
+    """Number of CPUs of this process for a local Ray.
 
     Ray itself counts the share of a container, and not that of `taskset` or of a job of Slurm.
     """
-    if cluster_address() is not None:
-        return None
     share = int(get_num_cpus(override_docker_cpu_warning=True))
     return max(1, min(len(os.sched_getaffinity(0)), share))
 

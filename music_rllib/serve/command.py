@@ -86,7 +86,7 @@ def serve(
         raise BadInputError(
             f"Ray Serve must be installed (pip install 'music_rllib[serve]'): {error}"
         ) from error
-    from music_rllib.runtime.ray_cluster import start_ray, stop_ray
+    from music_rllib.runtime.ray_cluster import cpus_here, start_ray, stop_ray
     from music_rllib.serve.application import ServeSettings, application, policy_of
 
     settings = ServeSettings(
@@ -94,10 +94,10 @@ def serve(
     )
     served = policy_of(settings)
     if cluster is None:
-        _check_replicas(settings, [len(os.sched_getaffinity(0))])
+        _check_replicas(settings, [cpus_here()])
     _on_signals(_interrupt)
     with contextlib.suppress(KeyboardInterrupt):
-        start_ray()
+        start_ray(num_cpus=None if cluster else cpus_here())
         try:
             _on_signals(_interrupt)  # Ray's own handler of SIGTERM would end the process at once
             if cluster is not None:

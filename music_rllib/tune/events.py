@@ -24,7 +24,8 @@ from music_rllib.training.job import NodeJob
 from music_rllib.training.worker import CAUSE, LEFT, NOTES, PAUSED, REPORTS, TRACEBACK
 
 RESTARTS = 3
-"""Restarts of a run whose worker dies. A run that raises an error fails at once."""
+"""Restarts of a run whose worker dies, until it has passed the step of its last death. A run that
+raises an error fails at once."""
 
 _COLOR = re.compile(r"\x1b\[[0-9;]*m")
 
@@ -51,7 +52,10 @@ class TuneEvents(Callback):
         self._listeners = list(listeners)
         self._failures = failures
         self._deaths: dict[str, list[str]] = {}
-        """Tracebacks of a node's workers that died, over all of its trials."""
+        """Tracebacks of a node's workers that died since it last made progress."""
+        self._reached: dict[str, int] = {}
+        self._died_at: dict[str, int] = {}
+        """Largest reported env steps of a node; the same when its worker last died."""
 
     def __getstate__(self) -> dict[str, Any]:
         # Tune pickles its callbacks into a snapshot that is never read.
@@ -73,6 +77,8 @@ class TuneEvents(Callback):
                 listener.noted(node, redact(note))
             if reports:
                 listener.reported(node, reports)
+        if reports:
+            self._note_progress(trial, node.key, reports[-1].env_steps)
 
     def on_trial_complete(self, *, trial: Trial, **_: Any) -> None:
         """The trial ended: it failed, paused, published its result, or left it to others."""
@@ -109,6 +115,16 @@ class TuneEvents(Callback):
         for listener in self._listeners:
             listener.finished(node, result)
 
+    def _note_progress(self, trial: Trial, key: str, steps: int) -> None:
+        """Forget the deaths of a run that has passed the step of the last one.
+
+        A long run on machines that can be reclaimed may lose many workers.
+        """
+        if key in self._deaths and steps > self._died_at[key]:
+            del self._deaths[key]
+            trial.run_metadata.num_failures = 0
+        self._reached[key] = max(steps, self._reached.get(key, 0))
+
     def on_trial_error(self, *, trial: Trial, **_: Any) -> None:
         """The trial's worker died or never started, and is not restarted."""
         error = _error_of(trial)
@@ -121,6 +137,7 @@ class TuneEvents(Callback):
         text, node = _COLOR.sub("", _text_of(trial)), self._node(trial)
         deaths = self._deaths.setdefault(node.key, [])
         deaths.append(text)
+        self._died_at[node.key] = self._reached.get(node.key, 0)
         cause = redact(cause_of(_error_of(trial), text)).splitlines()[0]
         text = (
             f"{cause} Another worker resumes from the last checkpoint "

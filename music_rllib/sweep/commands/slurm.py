@@ -22,7 +22,7 @@ Examples:
     --sbatch=--account=lab --storage /shared/results --submit
       write and submit it
   music-rllib status /shared/results/NAME
-      the progress of all tasks
+      finished runs of all tasks, and what the task that wrote last computes
 """
 FIXED = ("--signal=B:TERM@120", "--requeue", "--open-mode=append", "--output=%x-%j.log")
 """Options of every script; later ones replace them."""
