@@ -30,6 +30,10 @@ help:  ## list the targets
 	@echo "  JOBS=4               number of simultaneous tests (default $(JOBS); each may use two cores)"
 
 venv: $(STAMP)  ## create .venv and install everything, once
+ifeq ($(origin PYTHON),command line)
+	@[ "$$($(BIN)/python -V)" = "$$("$(PYTHON)" -V)" ] || \
+	  { echo "$(VENV) has $$($(BIN)/python -V); for '$(PYTHON)' add VENV=.venv-other." >&2; exit 1; }
+endif
 
 # Install torch first: with its exact version in place, the second, much larger resolution cannot
 # try other builds of it, each of which is a download of gigabytes.

@@ -53,7 +53,9 @@ def main() -> None:
     start_ray(1)
     training = TrainingRun(settings())
     fill(training.algorithm.replay, TRANSITIONS)
+    training.advance()  # evaluates the untrained policy
     training.advance()
+    assert training.algorithm.grad_updates > 0
     with TemporaryDirectory() as folder:
         save(training, NodeStore(folder).work_folder("0" * 20), Path(folder), 1)
     # Not `ru_maxrss`, which starts at the peak of the parent process.

@@ -43,6 +43,7 @@ def record(py_spy: str, arguments: argparse.Namespace) -> int:
     if arguments.native:
         options.append("--native")
     training = [sys.executable, "-m", "benchmarks.peer", "ours", "128", "0.4"]
+    arguments.output.unlink(missing_ok=True)
     finished = subprocess.run(
         [py_spy, "record", *options, "--", *training],
         input=f"{arguments.seconds}\n",
@@ -50,7 +51,7 @@ def record(py_spy: str, arguments: argparse.Namespace) -> int:
         text=True,
         check=False,
     )
-    if not arguments.output.exists():
+    if finished.returncode or not arguments.output.exists():
         print(finished.stderr, file=sys.stderr)
         return 1
     print(f"{arguments.output}: {finished.stdout.splitlines()[-1]}")

@@ -10,9 +10,12 @@ import gymnasium_robotics
 
 from music_rllib.policy import load_policy
 
+if len(sys.argv) != 2:
+    sys.exit(__doc__)
 gym.register_envs(gymnasium_robotics)
 policy = load_policy(sys.argv[1])
-env = gym.make(policy.task.env_id)
+options = {**policy.task.env_kwargs, "max_episode_steps": policy.max_episode_steps}
+env = gym.make(policy.task.env_id, **options)
 observation, _ = env.reset(seed=0)
 total, done = 0.0, False
 while not done:

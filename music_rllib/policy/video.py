@@ -21,7 +21,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from music_rllib.envs.make import Env
 from music_rllib.errors import BadInputError
-from music_rllib.policy.policy import Policy
+from music_rllib.policy.policy import Policy, PolicyError
 from music_rllib.policy.rollout import EpisodeResult, EpisodeStep, open_task, play
 
 FORMATS = (".mp4", ".gif")
@@ -61,7 +61,10 @@ def film(
     renderer, why_not = find_renderer(os.environ.get("MUJOCO_GL"))
     if renderer is not None:
         os.environ["MUJOCO_GL"] = renderer
-    env = open_task(policy, render_mode="rgb_array", **sizes)
+    try:
+        env = open_task(policy, render_mode="rgb_array", **sizes)
+    except PolicyError:  # it may have a size of its own
+        env = open_task(policy, render_mode="rgb_array")
     try:
         if why_not is not None and hasattr(env.unwrapped, "mujoco_renderer"):
             raise VideoError(why_not)

@@ -50,13 +50,16 @@ def export_best(location: SweepLocation, stage_name: str | None, output: Path) -
     best = _best(opened, stage, sweep, metric, searches)
     others = best.pop("other_tasks", None)
     if not others:
-        return _export_condition(opened, stage, sweep, best, metric, output)
+        chosen = _export_condition(opened, stage, sweep, best, metric, output)
+        _remove_others(output, chosen["policies"])
+        return chosen
     rows = [best, *others]
     exported = [
         _export_condition(opened, stage, sweep, row, metric, output / row["task"]) for row in rows
     ]
     why = (f"{row['task']}: {one['why']}" for row, one in zip(rows, exported, strict=True))
     policies = [policy for one in exported for policy in one["policies"]]
+    _remove_others(output, policies)
     return exported[0] | {"why": "\n".join(why), "policies": policies}
 
 
@@ -153,6 +156,23 @@ def _export(opened: OpenSweep, key: str, folder: Path, chosen: Mapping[str, Any]
     except OSError as error:
         place = error.filename or folder
         raise StorageError(f"{place} must be writable: {error.strerror}") from error
+
+
+def _remove_others(output: Path, policies: Sequence[Mapping[str, Any]]) -> None:
+    """Remove what an earlier call with one task, or with several, has left in `output`.
+
+    Readers of `output` would find the policy of the earlier call.
+    """
+    if not policies:
+        return
+    folder = Path(policies[0]["folder"])
+    is_single = folder == output.absolute()
+    others = [one.parent for one in output.glob(f"*/{CHOSEN}")] if is_single else [output]
+    for other in (one for one in others if (one / CHOSEN).is_file()):
+        for part in [other / one.name for one in folder.iterdir()]:
+            shutil.rmtree(part) if part.is_dir() else part.unlink(missing_ok=True)
+        if not any(other.iterdir()):
+            other.rmdir()
 
 
 def sweep_of_run(sweep: OpenSweep, key: str, folder: Path) -> dict[str, Any]:

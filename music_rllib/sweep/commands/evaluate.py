@@ -82,12 +82,12 @@ def evaluate(
     place = find_policy(run, storage)
     try:
         policy = load_policy(place, named_environment(env))
-        with closing(open_task(policy)) as task:
-            results = list(play(policy, task, episodes, seed))
-        if video is not None:
+        if video is not None:  # first: it may fail, and many episodes take minutes
             title = f"{policy.task.name}  ·  {policy.variant}  ·  {policy.env_steps:,} env steps"
             frames, _ = film(policy, min(video_episodes, episodes), seed, title)
             write_video(video, frames)
+        with closing(open_task(policy)) as task:
+            results = list(play(policy, task, episodes, seed))
     except OSError as error:
         raise BadInputError(str(error)) from error
     document = _document(place, policy, results, seed) | {"video": str(video) if video else None}

@@ -280,7 +280,12 @@ def test_best_takes_the_middle_run_of_the_best_condition(
     assert (plan.code, "1 finished earlier and reused, 0 env" in plan.output) == (0, True)
     assert json.loads((folder / "chosen.json").read_text())["node"] == policy["node"]
     assert policy["node"] in sweep.finished
+    # An export with several tasks, and a file of the user.
+    shutil.copytree(folder, folder / "FetchPush")
+    (folder / "notes.txt").touch()
     again = program("best", f"{storage}/mine", "--output", "out")
+    assert not (folder / "FetchPush").exists(), "readers would find two policies"
+    assert (folder / "notes.txt").exists()
     assert (again.code, "train q = 1.5: success " in again.output) == (0, True)
     assert "entropy -0.32 nats" in again.output
 
