@@ -155,7 +155,7 @@ def test_an_environment_that_hangs_in_the_checks_ends_the_program(program: Progr
         "Hanging": document["environments"]["Point"]
         | {"env_id": "point_env:Hanging-v0", "env_kwargs": {"at": 1, "locked": True}}
     }
-    document["resources"] |= {"hang_minutes": 0.1}
+    document["resources"] |= {"hang_minutes": 0.03}
     program.write(document)
     code, _, errors = program.run(command="plan", timeout=sweeps.PATIENCE)
     assert code == 2

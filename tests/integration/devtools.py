@@ -168,8 +168,10 @@ class Page:
         raise AssertionError(f"no {missing} in:\n{text[:3000]}\nerrors: {self.errors}")
 
     async def picture(self, name: str) -> None:
-        """Save a screenshot of the window as the PNG `name`."""
+        """Save a screenshot of the window as the PNG `name`, if a folder is given for it."""
+        if not (folder := os.environ.get("MUSIC_RLLIB_PICTURES")):
+            return
         await asyncio.sleep(0.5)
         reply = await self._send("Page.captureScreenshot", format="png")
-        path = Path(os.environ.get("MUSIC_RLLIB_PICTURES") or self._folder) / name
+        path = Path(folder) / name
         path.write_bytes(base64.b64decode(reply["data"]))

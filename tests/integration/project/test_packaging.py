@@ -206,8 +206,8 @@ def _requirements_of(name: str, extras: set[str]) -> Iterator[Requirement]:
 
 
 # Part of the `bench` extra, installed by `make bench`: its dependencies cannot be looked up.
-NOT_IN_THE_TESTS = {"sb3-contrib", "sbx-rl", "stable-baselines3", "furo", "myst-parser", "sphinx"}
-"""Packages that `make bench` and `make docs` install."""
+NOT_IN_THE_TESTS = {"sb3-contrib", "sbx-rl", "stable-baselines3"}
+"""Packages that `make bench` installs."""
 
 
 def test_constraints_pin_everything_that_is_pulled_in() -> None:

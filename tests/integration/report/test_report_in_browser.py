@@ -304,6 +304,7 @@ def test_the_live_page_updates_in_place(
     asyncio.run(use())
 
 
+@pytest.mark.thorough
 def test_the_live_page_of_a_study_half_way(
     open_page: Callable[[], Page], serve: Callable[[Callable[[], str]], str], tmp_path: Path
 ) -> None:

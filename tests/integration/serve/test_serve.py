@@ -165,7 +165,7 @@ def test_fuzzing_the_application_finds_no_server_error(tmp_path: Path) -> None:
 
 def test_fuzzing_the_service_finds_no_server_error(service: Service, tmp_path: Path) -> None:
     """Without the phase `coverage`, which the application has passed: this tests Serve's part."""
-    options = ("--phases", "examples,fuzzing", "--max-examples", "25")
+    options = ("--phases", "examples,fuzzing", "--max-examples", "5")
     done = fuzz(service.url, TOKEN, tmp_path, *options)
     assert done.returncode == 0, done.stdout + done.stderr
 

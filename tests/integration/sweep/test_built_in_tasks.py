@@ -232,7 +232,9 @@ def test_the_checks_of_the_page_hold() -> None:
 
 def test_the_declarations_of_the_page_fit_their_environments(tmp_path: Path) -> None:
     path = tmp_path / "example.yaml"
-    for example in re.findall(r"^```yaml\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE):
+    examples = re.findall(r"^```yaml\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
+    assert examples
+    for example in examples:
         path.write_text(example, encoding="utf-8")
         check_environments(make_plan(load_config(path)))
 

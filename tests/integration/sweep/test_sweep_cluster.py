@@ -185,19 +185,6 @@ def run_sweep(
     return subprocess.CompletedProcess(process.args, process.returncode, output, errors)
 
 
-def test_more_cpus_than_any_node_has(
-    head: Head, sweep_document: dict[str, Any], tmp_path: Path
-) -> None:
-    """Both nodes together have two, but a run needs one node."""
-    sweep_document["resources"] = {"cpus_per_run": 2}
-    done = run_sweep(head, sweep_document, tmp_path)
-    assert done.returncode == 2, done.stderr
-    assert "resources.cpus_per_run must fit into one node of the cluster, whose largest" in (
-        done.stderr
-    )
-    assert not list((tmp_path / "results").glob("*/config.json")), "it is no sweep yet"
-
-
 FAKE_HEAD = "f" * 51 + "00000"
 """Node id of the head for Ray's provider of simulated nodes."""
 

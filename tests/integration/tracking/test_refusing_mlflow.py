@@ -20,7 +20,6 @@ from tests.kept_sweep import kept_sweep
 
 TODO = {
     401: "Set MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD in the environment",
-    403: "Set MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD in the environment",
     500: "The server's own log says why",
 }
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -31,11 +30,6 @@ from music_rllib.sweep.listeners.state_file import StateFile
 PAUSE = 3_600_000
 """Milliseconds between two sittings."""
 CODE = {names.TAG_GIT_COMMIT: "c0ffee", f"{names.TAG_VERSION_PREFIX}torch": "2.0"}
-
-
-@pytest.fixture(autouse=True)
-def no_waiting_for_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(os, "fsync", lambda _: None)
 
 
 def reports(q: float, seed: int, steps: int) -> list[Report]:
