@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from itertools import chain, takewhile
+from itertools import chain
 from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
@@ -34,10 +34,10 @@ from music_rllib.report.figures.choice import (
 from music_rllib.report.figures.draw import files
 from music_rllib.report.figures.plots import Legend, Subplot
 from music_rllib.report.page import SweepReport, render, runs_table
-from music_rllib.report.two_sweeps import difference_tables, titles
+from music_rllib.report.two_sweeps import difference_tables
 from music_rllib.report.videos import Videos, make_videos
 from music_rllib.results.analysis import METRICS, StageAnalysis, analyse, mixed
-from music_rllib.results.answer import answer, claim_rows, mean_rows
+from music_rllib.results.answer import claim_rows, mean_rows
 from music_rllib.results.conditions import StageRuns
 from music_rllib.results.data import ReportError, Sweep
 from music_rllib.results.statistics import Array
@@ -103,32 +103,19 @@ def build_report(
         study_drawings(study),
     )
     sentences = limitations(sweep, analyses, live=live or both is not None)
-    answers = answer(sweep, study)
-    if both is not None:  # each has a plan of its own
-        answers = [*_answers_of(both)]
-        sentences += [f"{one.name}: {line}" for one in both for line in _missing(one)]
+    for one in both or ():  # each has a plan of its own
+        sentences += [f"{one.name}: {line}" for line in _missing(one)]
     return SweepReport(
         sweep=sweep,
         analyses=analyses,
         study=study,
-        answer=answers,
+        both=both,
         drawings=list(_with_own_names(_without_chance(drawings, stages))),
         differences=() if both is None else difference_tables(*both, analyses),
         limitations=[*sentences, *filter(None, [damaged])],
         command=command,
         videos=make_videos(sweep, analyses, storage, environments) if videos else Videos(),
     )
-
-
-def _answers_of(sweeps: tuple[Sweep, Sweep]) -> Iterator[str]:
-    """The questions and verdicts of two sweeps."""
-    for title, sweep in zip(titles(*sweeps), sweeps, strict=True):
-        sentences = answer(sweep, study_of(sweep))
-        yield from (f"{title}: {line}" for line in takewhile(_is_no_detail, sentences))
-
-
-def _is_no_detail(sentence: str) -> bool:
-    return not sentence.startswith("Metric: ")
 
 
 def _without_chance(drawings: Iterator[Drawing], stages: Sequence[StageRuns]) -> Iterator[Drawing]:

@@ -9,6 +9,8 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import cached_property
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +21,13 @@ from music_rllib import names
 from music_rllib.report.charts import chart_data
 from music_rllib.report.figures.choice import COST, GROUPS, PERFORMANCE, PRIMARY, Drawing, slug
 from music_rllib.report.figures.draw import inline
+from music_rllib.report.two_sweeps import titles
 from music_rllib.report.videos import Videos
 from music_rllib.results.analysis import StageAnalysis
-from music_rllib.results.answer import planned_in_words
+from music_rllib.results.answer import answer, planned_in_words
 from music_rllib.results.conditions import SIDE_BY_SIDE, StageRuns
 from music_rllib.results.data import Sweep
-from music_rllib.results.study import Study
+from music_rllib.results.study import Study, study_of
 from music_rllib.results.tables import (
     DASH,
     Code,
@@ -71,8 +74,8 @@ class SweepReport:
     analyses: Sequence[StageAnalysis]
     study: Study
     """The planned comparisons and all others."""
-    answer: Sequence[str]
-    """The study in sentences, the question first; of two sweeps, both studies."""
+    both: tuple[Sweep, Sweep] | None = None
+    """The two sweeps that `sweep` consists of, in a report on two sweeps."""
     drawings: Sequence[Drawing]
     limitations: Sequence[str]
     """Sentences about missing runs and about runs to treat with care."""
@@ -81,6 +84,21 @@ class SweepReport:
     videos: Videos
     differences: Sequence[Table] = ()
     """Tables of the differences of two sweeps."""
+
+    @cached_property
+    def answer(self) -> Sequence[str]:
+        """The study in sentences, the question first; of two sweeps, questions and verdicts."""
+        if self.both is None:
+            return answer(self.sweep, self.study)
+        found: list[str] = []
+        for title, sweep in zip(titles(*self.both), self.both, strict=True):
+            verdicts = takewhile(_is_no_detail, answer(sweep, study_of(sweep)))
+            found += [f"{title}: {line}" for line in verdicts]
+        return found
+
+
+def _is_no_detail(sentence: str) -> bool:
+    return not sentence.startswith("Metric: ")
 
 
 _PAGES = Environment(

@@ -48,7 +48,6 @@ from music_rllib.runtime.process import early, without_collections
 from music_rllib.store.patience import be_patient
 from music_rllib.store.storage import check_storage, is_remote, resolve_storage
 from music_rllib.sweep import preflight
-from music_rllib.sweep.clean import check_not_in_use
 from music_rllib.sweep.preflight import check_demand
 from music_rllib.sweep.views.plan import cluster_answer, plan_answer, plan_view
 
@@ -150,7 +149,10 @@ def run(
             with alone(opened.location, partial(_say, console)):
                 if opened.damaged or again:
                     drivers.check_alone()
-                check_not_in_use(opened.location, [run.key for run in again])
+                if again:
+                    from music_rllib.sweep.clean import check_not_in_use
+
+                    check_not_in_use(opened.location, [run.key for run in again])
                 opened = reopened(opened)  # another command may have deleted runs
                 remove_damaged(opened, warn)
                 opened = accept_environments(remove_runs(opened, again, warn), kept, warn)
