@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -167,12 +168,21 @@ def _remove_others(output: Path, policies: Sequence[Mapping[str, Any]]) -> None:
         return
     folder = Path(policies[0]["folder"])
     is_single = folder == output.absolute()
-    others = [one.parent for one in output.glob(f"*/{CHOSEN}")] if is_single else [output]
-    for other in (one for one in others if (one / CHOSEN).is_file()):
+    exports = [one.parent for one in output.glob(f"*/{CHOSEN}")]
+    # A sub-folder with another name than its task's is the user's.
+    of_tasks = [one for one in exports if _task_of(one) == one.name]
+    for other in of_tasks if is_single else [output] * (output / CHOSEN).is_file():
         for part in [other / one.name for one in folder.iterdir()]:
             shutil.rmtree(part) if part.is_dir() else part.unlink(missing_ok=True)
         if not any(other.iterdir()):
             other.rmdir()
+
+
+def _task_of(export: Path) -> object:
+    try:
+        return json.loads((export / CHOSEN).read_text(encoding="utf-8")).get("task")
+    except (OSError, ValueError, AttributeError):
+        return None
 
 
 def sweep_of_run(sweep: OpenSweep, key: str, folder: Path) -> dict[str, Any]:

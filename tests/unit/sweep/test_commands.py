@@ -281,11 +281,13 @@ def test_best_takes_the_middle_run_of_the_best_condition(
     assert json.loads((folder / "chosen.json").read_text())["node"] == policy["node"]
     assert policy["node"] in sweep.finished
     # An export with several tasks, and a file of the user.
-    shutil.copytree(folder, folder / "FetchPush")
+    shutil.copytree(folder, folder / policy["task"])
+    shutil.copytree(folder / policy["task"], folder / "mine")
     (folder / "notes.txt").touch()
     again = program("best", f"{storage}/mine", "--output", "out")
-    assert not (folder / "FetchPush").exists(), "readers would find two policies"
+    assert not (folder / policy["task"]).exists(), "readers would find two policies"
     assert (folder / "notes.txt").exists()
+    assert (folder / "mine" / "handoff").exists()
     assert (again.code, "train q = 1.5: success " in again.output) == (0, True)
     assert "entropy -0.32 nats" in again.output
 
