@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 
 import numpy as np
@@ -66,7 +67,7 @@ def _first(passage: tuple[float, bool] | None) -> str:
 def provenance(sweep: Sweep) -> str:
     """Commits, versions and evaluation episodes of the runs."""
     commits = all_of(
-        run.tags.get(names.TAG_GIT_COMMIT, "")[:7]
+        re.sub(r"^(.{7})[^-]*", r"\1", run.tags.get(names.TAG_GIT_COMMIT, ""))
         for run in sweep.runs
         if run.status != "SCHEDULED"
     )
