@@ -320,8 +320,8 @@ def made_files(folder: Path) -> list[str]:
 
 def _files_of(report: SweepReport) -> Iterator[tuple[str, bytes]]:
     """Paths, below the report's folder, and contents of its files."""
-    shown = overview(report.sweep, [analysis.stage for analysis in report.analyses])
-    figures = [Figure(PICTURE, shown, [])] if shown else []
+    shown, legend = overview(report.sweep, [analysis.stage for analysis in report.analyses])
+    figures = [Figure(PICTURE, shown, legend)] if shown else []
     figures += [Figure(one.name, one.subplots, one.legend) for one in report.drawings]
     with _drawn(figures) as contents:
         yield PAGE, render(report).encode()  # while other processes draw

@@ -13,6 +13,7 @@ from music_rllib.report.figures.plots import (
     MOST_BANDS,
     Legend,
     Style,
+    Styles,
     Subplot,
     alpha_subplot,
     curve_subplot,
@@ -64,6 +65,8 @@ MOST_FACETS = 8
 """Largest number of subplots that the curves of one task are spread over."""
 MOST_LINES = 10
 """Largest number of lines in a subplot of the overview."""
+MOST_IN_LEGEND = 4
+"""Largest number of lines for which each subplot of the overview has a legend of its own."""
 MOST_DIFFERENCES = 20
 """Largest number of comparisons on a task that have a figure."""
 
@@ -348,13 +351,30 @@ def _differences(study: Study, stage: str) -> Iterator[Drawing]:
 # The overview -----------------------------------------------------------------------------------
 
 
-def overview(sweep: Sweep, stages: Sequence[StageRuns]) -> tuple[Subplot, ...]:
-    """For each task its primary metric, the displacement of objects, and the MI bound."""
+def overview(sweep: Sweep, stages: Sequence[StageRuns]) -> tuple[tuple[Subplot, ...], Legend]:
+    """For each task its primary metric, the displacement of objects, and the MI bound.
+
+    Returns:
+        The subplots, and the legend of all of them; empty if each has its own.
+    """
     tasks = dict.fromkeys(task for stage in stages for task in stage.tasks)
-    return tuple(subplot for task in tasks for subplot in _of_task(sweep, stages, task))
+    parts = [part for task in tasks for part in _of_task(sweep, stages, task)]
+    entries = [entry for *_, legend in parts for entry in legend]
+    together = dict(entries)
+    # Within a subplot, a legend of many lines would hide them.
+    below = max((len(legend) for *_, legend in parts), default=0) > MOST_IN_LEGEND and all(
+        together[label] == style for label, style in entries
+    )
+    subplots = tuple(
+        curve_subplot(metric, task, curves, styles, () if below else legend)
+        for metric, task, curves, styles, legend in parts
+    )
+    return subplots, list(together.items()) if below else []
 
 
-def _of_task(sweep: Sweep, stages: Sequence[StageRuns], task: str) -> Iterator[Subplot]:
+def _of_task(
+    sweep: Sweep, stages: Sequence[StageRuns], task: str
+) -> Iterator[tuple[Metric, str, Sequence[Curve], Styles, Legend]]:
     stages = [stage for stage in stages if task in stage.tasks]
     shown = {condition: stage for stage in stages for condition in stage.compared}
     styles, primary = styles_of(tuple(shown)), sweep.primary_metric(task)
@@ -377,4 +397,4 @@ def _of_task(sweep: Sweep, stages: Sequence[StageRuns], task: str) -> Iterator[S
                 if len(stage.compared) > 1 or not parts:
                     parts.append(condition.label)
                 legend.append((", ".join(parts), styles[condition]))
-            yield curve_subplot(metric, task, curves, styles, legend)
+            yield metric, task, curves, styles, legend

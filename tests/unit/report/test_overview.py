@@ -17,7 +17,9 @@ DATA = Path(__file__).parents[3] / "docs" / "results" / "data"
 def subplots(sweep: Sweep) -> dict[str, list[str]]:
     """Task and axis of each subplot, and its legend."""
     shown = {}
-    for subplot in overview(sweep, [one.stage for one in analyse(sweep)]):
+    found, below = overview(sweep, [one.stage for one in analyse(sweep)])
+    assert not below
+    for subplot in found:
         axes = Figure().add_subplot()
         subplot.draw(axes)
         legend = axes.get_legend()
@@ -37,3 +39,14 @@ def test_the_overview_shows_all_stages_and_the_bound_of_music_u() -> None:
 def test_conditions_of_a_single_stage_are_labelled_by_q() -> None:
     sweep = read_archive(DATA / "proof-fetch-push-her")
     assert subplots(sweep)["FetchPush: success rate"] == ["q = 1", "q = 1.5", "q = 2"]
+
+
+def test_many_conditions_have_one_legend_below_the_subplots() -> None:
+    """A legend of nine lines in each subplot would hide them."""
+    sweep = read_archive(DATA / "intrinsic-rewards")
+    found, below = overview(sweep, [one.stage for one in analyse(sweep)])
+    assert {"her", "displacement", "pretrain"} <= {label for label, _ in below}
+    for subplot in found:
+        axes = Figure().add_subplot()
+        subplot.draw(axes)
+        assert axes.get_legend() is None
