@@ -1,6 +1,7 @@
 """Errors that a user sees, and the exit codes of every command."""
 
 import re
+import signal
 
 FAILED, BAD_INPUT = 1, 2
 _COLORS = re.compile(r"\x1b\[[0-9;]*m")
@@ -40,6 +41,12 @@ def reason_of(error: Exception) -> str:
 def shorten(text: str, limit: int = 300) -> str:
     """Cut a text to `limit` characters, ending with dots."""
     return text if len(text) <= limit else text[: limit - 3] + "..."
+
+
+def is_stop(error: BaseException | None) -> bool:
+    """Whether an error is the user's signal: Ctrl-C, or SIGTERM by the handler of `ray.init`."""
+    terminated = isinstance(error, SystemExit) and error.code == signal.SIGTERM
+    return terminated or isinstance(error, KeyboardInterrupt)
 
 
 class BadInputError(Exception):

@@ -21,7 +21,7 @@ from music_rllib import names
 from music_rllib.report.charts import chart_data
 from music_rllib.report.figures.choice import COST, GROUPS, PERFORMANCE, PRIMARY, Drawing, slug
 from music_rllib.report.figures.draw import inline
-from music_rllib.report.two_sweeps import titles
+from music_rllib.report.two_sweeps import titles_of
 from music_rllib.report.videos import Videos
 from music_rllib.results.analysis import StageAnalysis
 from music_rllib.results.answer import answer, planned_in_words
@@ -91,7 +91,7 @@ class SweepReport:
         if self.both is None:
             return answer(self.sweep, self.study)
         found: list[str] = []
-        for title, sweep in zip(titles(*self.both), self.both, strict=True):
+        for title, sweep in zip(titles_of(*self.both), self.both, strict=True):
             verdicts = takewhile(_is_no_detail, answer(sweep, study_of(sweep)))
             found += [f"{title}: {line}" for line in verdicts]
         return found

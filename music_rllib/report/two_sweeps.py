@@ -19,14 +19,14 @@ MOST_VALUES = 6
 
 def joined_sweeps(first: Sweep, second: Sweep) -> Sweep:
     """All runs of both sweeps; stage names begin with the sweep, so that stages are compared."""
-    names_of = titles(first, second)
-    both = merged(*map(_renamed, (first, second), names_of))
+    titles = titles_of(first, second)
+    both = merged(*map(_renamed, (first, second), titles))
     return replace(
-        both, name=" and ".join(names_of), config=None, plans=(), searches=(), earlier=None
+        both, name=" and ".join(titles), config=None, plans=(), searches=(), earlier=None
     )
 
 
-def titles(first: Sweep, second: Sweep) -> tuple[str, str]:
+def titles_of(first: Sweep, second: Sweep) -> tuple[str, str]:
     """Two different names."""
     if first.name != second.name:
         return first.name, second.name
@@ -58,11 +58,11 @@ def difference_tables(
         second: The second sweep.
         analyses: The analyses of the sweep that :func:`joined_sweeps` makes of them.
     """
-    both = titles(first, second)
-    return [_settings_table(first, second, both), _results_table(analyses, both)]
+    titles = titles_of(first, second)
+    return [_settings_table(first, second, titles), _results_table(analyses, titles)]
 
 
-def _settings_table(first: Sweep, second: Sweep, both: tuple[str, str]) -> Table:
+def _settings_table(first: Sweep, second: Sweep, titles: tuple[str, str]) -> Table:
     one, other = _setting_values(first), _setting_values(second)
     rows = [
         (*key, _values_text(one.get(key)), _values_text(other.get(key)))
@@ -71,7 +71,7 @@ def _settings_table(first: Sweep, second: Sweep, both: tuple[str, str]) -> Table
     ]
     return Table(
         title="Settings that differ",
-        header=("In stage", "Setting", *both),
+        header=("In stage", "Setting", *titles),
         rows=rows or [("all", "none", None, None)],
     )
 
@@ -94,8 +94,8 @@ def _values_text(values: set[str] | None) -> str | None:
     return ", ".join(sorted(values)[:MOST_VALUES]) + (f" and {more} more" if more > 0 else "")
 
 
-def _results_table(analyses: Sequence[StageAnalysis], both: tuple[str, str]) -> Table:
-    one, other = (_finals(analyses, title) for title in both)
+def _results_table(analyses: Sequence[StageAnalysis], titles: tuple[str, str]) -> Table:
+    one, other = (_finals(analyses, title) for title in titles)
     rows = []
     for key in dict.fromkeys((*one, *other)):
         found = [finals[key].estimate if key in finals else None for finals in (one, other)]
@@ -104,7 +104,7 @@ def _results_table(analyses: Sequence[StageAnalysis], both: tuple[str, str]) -> 
         rows.append((*key, *found, gap))
     return Table(
         title="Final values of both sweeps",
-        header=("In stage", "Task", "Condition", *both, "Difference"),
+        header=("In stage", "Task", "Condition", *titles, "Difference"),
         rows=rows,
         note="Means of the last evaluation of finished runs with their 95% CI. Difference: second "
         "sweep minus first sweep.",

@@ -20,7 +20,7 @@ from music_rllib.command_line import console_for, how_to_continue, print_json
 from music_rllib.config.load import load_config, warnings_of
 from music_rllib.config.schema import MlflowSettings, SweepConfig
 from music_rllib.envs.tasks import search_in
-from music_rllib.errors import BadInputError
+from music_rllib.errors import BadInputError, is_stop
 from music_rllib.experiment.open_sweep import (
     OpenSweep,
     accept_environments,
@@ -282,12 +282,10 @@ def _stopped_early(console: Console, stopped: KeyboardInterrupt | SystemExit) ->
     Raises:
         SystemExit: The cause was not a signal.
     """
-    if isinstance(stopped, KeyboardInterrupt):
-        number = early.received or signal.SIGINT
-    elif stopped.code == signal.SIGTERM:  # raised by the handler that `ray.init` sets
-        number = signal.SIGTERM
-    else:
+    if not is_stop(stopped):
         raise stopped
+    by_ray = isinstance(stopped, SystemExit)
+    number = signal.SIGTERM if by_ray else early.received or signal.SIGINT
     _say(console, how_to_continue(has_begun=False))
     return 128 + number
 

@@ -13,7 +13,6 @@ import logging
 import os
 import shlex
 import shutil
-import signal
 import uuid
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -28,7 +27,7 @@ import yaml
 
 from music_rllib import names
 from music_rllib.command_line import PROGRAM
-from music_rllib.errors import TrackingError
+from music_rllib.errors import TrackingError, is_stop
 from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.run_info import RunInfo
 from music_rllib.redaction import redact, without_secrets
@@ -248,9 +247,7 @@ class Tracker:
         if kind is None:
             self.close("FINISHED")
         else:
-            terminated = isinstance(error, SystemExit) and error.code == signal.SIGTERM
-            is_stopped = kind is KeyboardInterrupt or terminated
-            self.close("KILLED" if is_stopped else "FAILED")
+            self.close("KILLED" if is_stop(error) else "FAILED")
 
     def _parent_run(self, config: Mapping[str, object]) -> RunQueue:
         """The parent run. It is created at once, as its children need its id."""

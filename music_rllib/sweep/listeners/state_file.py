@@ -18,6 +18,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Self
 
 from music_rllib.config.run_settings import VARIANTS
+from music_rllib.errors import is_stop
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.plan import Node
@@ -82,12 +83,10 @@ class StateFile(Listener):
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, *_: object
+        self, _kind: type[BaseException] | None, error: BaseException | None, *_: object
     ) -> None:
-        # Until the runs begin, the handler that `ray.init` sets raises SystemExit.
-        terminated = isinstance(error, SystemExit) and error.code == signal.SIGTERM
         if self._driver["ended"] is None:
-            self.end("stopped" if kind is KeyboardInterrupt or terminated else "failed")
+            self.end("stopped" if is_stop(error) else "failed")
 
     def end(self, outcome: str) -> None:
         """Write the outcome of the sweep: `finished`, `failed` or `stopped`."""
