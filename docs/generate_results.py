@@ -9,7 +9,7 @@ this name, the table has all its runs that any export in docs/results/data has, 
 trained them; otherwise it has the runs of the export docs/results/data/NAME. KIND is
 
 - without NAME, over the studies of `summary.STUDIES`: `headline`, `differences`, `summary`,
-  `sampled`, `exploration` or `robustness`;
+  `sampled`, `one-family`, `collapses`, `exploration` or `robustness`;
 - for a planned study: `answer`, `outcomes` (with stages), `seeds`, `cells`, `figure` (with its
   name), `learning`, `arms`, `peers`, `equal-total`, `hours` or `progress`;
 - for any sweep: `totals` (with a pretrained stage and one from scratch), `runs`, `provenance`,
@@ -40,9 +40,11 @@ from docs.result_pages.studies import (
 )
 from docs.result_pages.success import stage_curves, stages_table, success
 from docs.result_pages.summary import (
+    collapses,
     differences_figure,
     equal_total_text,
     headline,
+    one_family,
     sampled_sentence,
     summary_table,
 )
@@ -91,6 +93,8 @@ def page(name: str, figures: dict[str, Drawing]) -> str:
         "differences": lambda: differences_figure(figures),
         "summary": lambda: "\n".join(summary_table()),
         "sampled": sampled_sentence,
+        "one-family": one_family,
+        "collapses": collapses,
         "exploration": lambda: "\n".join(exploration_table()),
         "robustness": lambda: "\n".join(robustness_list()),
         "equal-total": equal_total_text,

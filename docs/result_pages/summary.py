@@ -16,14 +16,14 @@ from docs.result_pages.words import percent, row, rule
 from music_rllib import names
 from music_rllib.report.figures.choice import Drawing
 from music_rllib.report.figures.plots import Subplot, differences_subplot
-from music_rllib.results import statistics as st
-from music_rllib.results.answer import not_excluded, numbers_in_words, verdict_in_words
+from music_rllib.results.answer import numbers_in_words, verdict_in_words
 from music_rllib.results.claims import (
     Claim,
     Contrast,
     Verdict,
     claims_of,
     contrast,
+    decided,
     exploratory,
 )
 from music_rllib.results.data import Sweep
@@ -45,12 +45,14 @@ STUDIES = {
 }
 """Setting of each study."""
 PAPER = {
-    ("FetchPush", "q = 1.5", "q = 1"): "Figure 4: faster",
+    ("FetchPush", "q = 1.5", "q = 1"): "Figure 4: faster to 85%",
     ("FetchPickAndPlace", "q = 1.5", "q = 1"): "Figure 5: better",
     ("FetchSlide", "q = 1.5", "q = 1"): "Figure 6: comparable; text: better",
 }
 COMPARED = ("q = 1.5", "q = 2")
 """Values that are compared with q = 1."""
+FEWEST_TASKS = 3
+"""Smallest number of tasks for a mean over them."""
 BETWEEN_STAGES = "stage = "
 """Start of the labels of a comparison of two stages."""
 
@@ -109,24 +111,51 @@ def headline() -> str:
 
 
 def average(claims: Sequence[Claim]) -> Contrast:
-    """The mean difference of studies. Each counts once; the spread between them is the error."""
-    gaps = np.array([float(claim.contrast.difference.value) for claim in claims])
+    """The mean difference of tasks, each the mean of its settings; their spread is the error."""
+    by_task: dict[str, list[float]] = {}
+    for claim in claims:
+        by_task.setdefault(claim.task, []).append(float(claim.contrast.difference.value))
+    gaps = np.array([np.mean(own) for own in by_task.values()])
     return contrast(gaps, 0.0 * gaps, paired=True)
 
 
 def _averages(claims: Sequence[Claim]) -> str:
-    """The average over studies of each q against q = 1; empty if they are few."""
+    """The mean over tasks of each q against q = 1; empty if a task has no such comparison."""
     of_q = {q: [c for c in claims if (c.first, c.second) == (q, "q = 1")] for q in COMPARED}
-    count = min(map(len, of_q.values()))
-    if count < st.FEWEST_FOR_INTERVAL:
+    tasks = {claim.task for claim in claims}
+    if len(tasks) < FEWEST_TASKS or any({c.task for c in own} != tasks for own in of_q.values()):
         return ""
     gaps = ((q, average(own).difference) for q, own in of_q.items())
     parts = (
         f"{q} minus q = 1, {g.value:+.2f} (95% CI {g.lower:.2f} to {g.upper:.2f})" for q, g in gaps
     )
     return (
-        f" Mean difference of the area over the {count} settings (not planned): {'; '.join(parts)}."
+        f" Mean difference of the area over the {len(tasks)} tasks, each the mean of its settings "
+        f"(not planned): {'; '.join(parts)}."
     )
+
+
+def one_family() -> str:
+    """The verdicts if all planned comparisons of two q were one family."""
+    studies = complete_studies()
+    claims = [claim for _, study in studies for claim in between_q(study.planned)]
+    counts = Counter(claim.verdict for claim in decided(claims, planned=True))
+    differences = counts[Verdict.SUPERIOR] + counts[Verdict.WORSE]
+    return (
+        f"With all {len(claims)} comparisons of q as one family, {differences} differences and "
+        f"{counts[Verdict.EQUIVALENT]} equivalences would be decided."
+    )
+
+
+def collapses() -> str:
+    """Rates of collapses that decided verdicts do not exclude, by the number of seeds."""
+    shares: dict[int, float] = {}
+    for claim in (claim for _, study in complete_studies() for claim in study.planned):
+        if claim.verdict is not Verdict.UNDECIDED and claim.collapses is not None:
+            seeds = claim.contrast.seeds[0]
+            shares[seeds] = max(claim.collapses, shares.get(seeds, 0.0))
+    parts = (f"{percent(shares[seeds])} ({seeds} seeds)" for seeds in sorted(shares, reverse=True))
+    return f"Collapses in up to {', '.join(parts)} of the seeds are not excluded by a verdict."
 
 
 def differences_figure(figures: dict[str, Drawing]) -> str:
@@ -144,7 +173,7 @@ def differences_figure(figures: dict[str, Drawing]) -> str:
     for q in COMPARED:
         own = [(label, claim) for label, claim in claims if claim.first == q]
         mean = replace(own[-1][1], contrast=average([claim for _, claim in own]))
-        own.append(("mean of all settings", mean))
+        own.append(("mean of the tasks (not planned)", mean))
         rows = [("" if subplots else label, claim) for label, claim in own]
         subplot = differences_subplot(f"{q} minus q = 1", rows, "difference of the area")
 
@@ -203,7 +232,8 @@ def summary_table() -> Iterator[str]:
     for sweep, study in complete_studies():
         setting = STUDIES[sweep.name]
         for claim, other in zip(compared(study), sampled(sweep, study), strict=True):
-            paper = PAPER.get((claim.task, claim.first, claim.second), "Figure 7: worse")
+            figure = "text" if claim.second == "q = 1" else "Figure 7"
+            paper = PAPER.get((claim.task, claim.first, claim.second), f"{figure}: worse")
             if setting == JOINT:
                 paper = paper.replace(":", " (with MUSIC):")
             comparison = f"{claim.first} against {claim.second}"
@@ -236,7 +266,7 @@ def equal_totals(sweep: Sweep, study: Study) -> Iterator[tuple[AtEqualTotal, AtE
 def verdict_cell(claim: Claim) -> str:
     """`**worse**, -0.05 (95% CI -0.08 to -0.02; p = 0.003, adjusted 0.0089)`."""
     verdict = "" if claim.verdict is Verdict.NONE else f"**{verdict_in_words(claim)}**, "
-    return f"{verdict}{numbers_in_words(claim)}{not_excluded(claim)}"
+    return f"{verdict}{numbers_in_words(claim)}"
 
 
 def equal_total_text(name: str) -> str:

@@ -48,6 +48,7 @@ IN_DETAIL = {
     "joint-her": "## FetchPush in the joint form, HER alone\n",
     "claims-push": "## FetchPush\n",
     "claims-pick-and-place": "## FetchPickAndPlace\n",
+    "claims-slide": "## FetchSlide\n",
 }
 """Studies whose tables are on the page of details: the text before them."""
 BETWEEN_Q = (("1.5", "1"), ("2", "1.5"), ("2", "1"))
@@ -171,10 +172,14 @@ def in_words(claim: Claim, *, planned: bool) -> str:
         return f"{interval}; unadjusted {own})"
     adjusted = p_text(claim["adjusted " + kind])
     more = "" if own == adjusted else f", adjusted {adjusted.removeprefix('p = ')}"
-    rate = f"; collapses in up to {100 * claim['collapses']:.0f}% of seeds are not excluded"
-    words = f"**{claim['verdict']}**, {interval}; {'TOST ' * alike}{own}{more})"
-    shown = claim["verdict"] != "undecided" and claim["collapses"] >= 0.05
-    return words + rate if shown else words
+    return f"**{claim['verdict']}**, {interval}; {'TOST ' * alike}{own}{more})"
+
+
+def not_excluded(claim: Claim) -> str:
+    """The rate of collapses beside a verdict; empty if it is small."""
+    if claim["verdict"] == "undecided" or claim["collapses"] < 0.05:
+        return ""
+    return f"; collapses in up to {100 * claim['collapses']:.0f}% of seeds are not excluded"
 
 
 def two_decimals(value: float, sign: str = "") -> str:
@@ -225,18 +230,39 @@ def test_every_row_of_the_summary() -> None:
 
 
 @pytest.mark.parametrize(("metric", "after"), [(MEAN, "# Results"), (SAMPLED, "How to read")])
-def test_the_averages_over_settings(metric: str, after: str) -> None:
-    """Each setting's difference is one observation."""
+def test_the_averages_over_tasks(metric: str, after: str) -> None:
+    """Each task, the mean of its settings, is one observation."""
     found = []
     for q in ("1.5", "2"):
         pairs = [[areas(*each, of, metric) for of in (q, "1")] for each in STUDIES.values()]
-        gaps = [compared(*pair)["difference"] for pair in pairs]
+        each = pd.Series([compared(*pair)["difference"] for pair in pairs])
+        gaps = each.groupby([task for task, _ in STUDIES]).mean()
         ends = stats.t.interval(0.95, len(gaps) - 1, np.mean(gaps), stats.sem(gaps))
         interval = f"{ends[0]:.2f} to {ends[1]:.2f}"
         found.append(f"q = {q} minus q = 1, {np.mean(gaps):+.2f} (95% CI {interval})")
-    text = f"Mean difference of the area over the {len(STUDIES)} settings (not planned): "
+    text = "Mean difference of the area over the 3 tasks, each the mean of its settings (not planned): "
     line = next(one for one in PAGE[PAGE.index(after) :].splitlines() if text in one)
     assert f"{text}{'; '.join(found)}." in line
+
+
+def test_all_comparisons_as_one_family() -> None:
+    pairs = [(each, first, second) for each in STUDIES.values() for first, second in BETWEEN_Q]
+    claims = [compared(areas(*each, a, MEAN), areas(*each, b, MEAN)) for each, a, b in pairs]
+    found = [claim["verdict"] for claim in decided(claims)]
+    alike = found.count("equivalent within 0.05")
+    differences = len(found) - found.count("undecided") - alike
+    text = f"With all {len(found)} comparisons of q as one family, {differences} differences and "
+    assert f"{text}{alike} equivalences would be decided." in PAGE
+
+
+def test_the_collapses_that_verdicts_do_not_exclude() -> None:
+    claims = [one for each in STUDIES.values() for one in planned(*each)]
+    rates: dict[int, float] = {}
+    for claim in claims:
+        if not_excluded(claim):
+            rates[claim["seeds"]] = max(claim["collapses"], rates.get(claim["seeds"], 0.0))
+    parts = [f"{rates[n]:.0%} ({n} seeds)" for n in sorted(rates, reverse=True)]
+    assert f"Collapses in up to {', '.join(parts)} of the seeds are not excluded" in PAGE
 
 
 def test_the_verdicts_at_several_alphas() -> None:
@@ -245,7 +271,8 @@ def test_the_verdicts_at_several_alphas() -> None:
     sides = {q: areas("q-entropy-factorial", "her", q, MEAN) for q in ("1", "1.5", "2")}
     claims = decided([compared(sides[a], sides[b]) for a, b in pairs])
     found = re.findall(r"^- q = .*, averaged over 5 settings: (.*)\.$", DETAILS, re.MULTILINE)
-    assert found == [in_words(one, planned=True).replace("**", "") for one in claims]
+    texts = [in_words(one, planned=True) + not_excluded(one) for one in claims]
+    assert found == [text.replace("**", "") for text in texts]
 
 
 def early(study: str, stage: str, q: str, metric: str) -> pd.Series:
@@ -385,9 +412,9 @@ def test_every_row_of_a_table_of_stages(study: str, total: int, page: str) -> No
     stages = [stage for stage in rows if stage != "her"]
     claims = decided([compared(scores[stage], scores["her"]) for stage in stages])
     for stage, claim in zip(stages, claims, strict=True):
-        assert rows[stage][1] == in_words(claim, planned=True)
+        assert rows[stage][1] == in_words(claim, planned=True) + not_excluded(claim)
     if study == "intrinsic-rewards-pick":  # the results page quotes one of them
-        assert rows["displacement"][1].split(";")[0] in PAGE
+        assert rows["displacement"][1].split(";")[0] in " ".join(PAGE.split())
     for stage, row in rows.items():
         values = rate_interval(scores[stage].to_numpy(), np.inf)
         assert row[2] == "{} [{}, {}]".format(*map(two_decimals, values))
@@ -408,6 +435,6 @@ def test_every_figure_of_the_readme_is_on_the_page() -> None:
         rf"minus q = 1, {numbers_of}", PAGE[: PAGE.index("The paper (Kim")]
     )
     for verdict, numbers in found:
-        assert f"**{verdict}**, {numbers};" in PAGE
+        assert f"**{verdict}**, {numbers};" in " ".join(PAGE.split())
     for percent in re.findall(r"\d+%(?! CI)", section):
         assert f"| {percent} [" in PAGE
