@@ -18,6 +18,7 @@ from music_rllib.envs.values import (
     BadNumberError,
     are_usable,
     check_numbers,
+    flag_of,
     number_of,
     shown,
     success_of,
@@ -125,6 +126,13 @@ class Recording:
         self._rewards[self.steps - 1] = number
         if success is not None:
             self._successes.append(success)
+
+    def ends(self, terminated: Any, truncated: Any) -> tuple[bool, bool]:
+        """The flags of the last step as bools; raises BadNumberError for other values."""
+        try:
+            return flag_of(terminated, "terminated"), flag_of(truncated, "truncated")
+        except ValueError as error:
+            raise BadNumberError.at(self.place, error) from None
 
     def _see(self, observation: Any) -> None:
         frame, layout = self._frames[self.steps], self._layout

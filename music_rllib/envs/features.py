@@ -30,8 +30,9 @@ def _expand_range(value: Any) -> Any:
     return tuple(range(int(bounds[1]), int(bounds[2])))
 
 
+Index = Annotated[int, Field(ge=0)]
 Indices = Annotated[
-    tuple[Annotated[int, Field(ge=0)], ...],
+    tuple[Index, ...],
     Field(max_length=MOST_INDICES),
     BeforeValidator(_expand_range, json_schema_input_type=tuple[int, ...] | str),
 ]
@@ -88,7 +89,7 @@ class Mirror(_Entries):
     direction, angles and angular velocities about the other two directions."""
     action: Indices = ()
     """Entries of the action that change their sign."""
-    swap: tuple[tuple[int, int], ...] = ()
+    swap: tuple[tuple[Index, Index], ...] = ()
     """Pairs of entries of the observation that change places, such as two fingers."""
 
     @model_validator(mode="after")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import mmap
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
@@ -39,7 +40,7 @@ Env = gym.Env[Any, Any]
 Floats = NDArray[np.float32]
 
 
-def make_env(env_id: str, **kwargs: Any) -> Env:
+def make_env(env_id: str, /, **kwargs: Any) -> Env:
     """Make a Gymnasium environment by its id, with the robotics tasks registered.
 
     The Fetch tasks get a faster step with the same results (`music_rllib.envs.fetch`). `close()`
@@ -52,8 +53,9 @@ def make_env(env_id: str, **kwargs: Any) -> Env:
     register_robotics()
     if ":" in env_id:
         make_importable(env_id.partition(":")[0])
-    # The checker takes a tenth of every step, and helps only an environment's authors.
-    env = gym.make(env_id, disable_env_checker=True, **kwargs)
+    # The checker takes a tenth of every step, and helps only an environment's authors. An
+    # environment may change its arguments, which are those of the next one.
+    env = gym.make(env_id, disable_env_checker=True, **copy.deepcopy(kwargs))
     from music_rllib.envs.fetch import speed_up  # after the notice is dropped
 
     speed_up(env)
@@ -180,12 +182,12 @@ def compute_reward_of(env: Env) -> GoalReward | None:
     return reward
 
 
-def goal_reward_of(env: Env, seed: int = 0) -> GoalReward:
+def goal_reward_of(env: Env, seed_range: tuple[int, int] = (0, LAST_SEED)) -> GoalReward:
     """The environment's `compute_reward` as a function of goals [B, G], checked.
 
-    Resets `env` with `seed` and takes some random steps. Without these checks, hindsight would
-    learn from wrong rewards (HandManipulatePen of Gymnasium-Robotics 1.4.2 mixes up the rows of a
-    batch).
+    Resets `env` with seeds of `seed_range` and takes some random steps. Without these checks,
+    hindsight would learn from wrong rewards (HandManipulatePen of Gymnasium-Robotics 1.4.2 mixes up
+    the rows of a batch).
 
     Raises:
         ValueError: A row's reward depends on more than its goals, is not the reward of a step, or
@@ -198,7 +200,7 @@ def goal_reward_of(env: Env, seed: int = 0) -> GoalReward:
             f"{name_of(env)} has no goals with a compute_reward"
         )
     try:
-        problem = _problem_of(reward, env, seed)
+        problem = _problem_of(reward, env, seed_range)
     except BadNumberError as error:
         raise ValueError(first_line(error)) from error
     except Exception as error:
@@ -211,27 +213,38 @@ def goal_reward_of(env: Env, seed: int = 0) -> GoalReward:
 
 _BY_ROW = "compute_reward does not compute each row of a batch independently"
 _KEPT = "goals lose digits in float32 on which rewards depend"
+_BY_GOALS = "compute_reward depends on more than its goals"
+_TRIED_EPISODES = 3
+"""Number of further episodes in which the same goals must have the same rewards."""
 _ROWS = 256
 """Number of goals whose rewards are compared before training."""
 _TRIED_STEPS = 20
 """Maximum number of random steps whose rewards are compared before training."""
 
 
-def _problem_of(reward: GoalReward, env: Env, seed: int) -> tuple[str, str] | None:
+def _problem_of(
+    reward: GoalReward, env: Env, seed_range: tuple[int, int]
+) -> tuple[str, str] | None:
     """The rule that rewards of goals around the first achieved one break, and how.
 
     Raises:
         BadNumberError: A step has another reward than its goals.
     """
-    first = env.reset(seed=seed)[0]
+    first = env.reset(seed=seed_range[0])[0]
     start, distance, achieved, desired = _goals_near(first)
     together = reward(achieved, desired)
+    if together.shape != (_ROWS,):
+        return _BY_ROW, f"{_ROWS} goals have rewards of shape {together.shape}"
     played = _play_some(reward, env, first)  # a reward may depend on the simulator's state
     alone = [reward(achieved[i : i + 1], desired[i : i + 1]) for i in range(_ROWS)]
-    apart = np.abs(together - np.concatenate(alone)) if together.shape == (_ROWS,) else np.ones(1)
-    if not apart.max() <= 1e-5 * np.abs(together).max():
+    tolerance = 1e-5 * np.abs(together).max()
+    if not np.abs(together - np.concatenate(alone)).max() <= tolerance:
         return _BY_ROW, "rewards change with the batch or the simulator"
     played.finish(terminated=False)
+    for number in range(_TRIED_EPISODES):  # one function computes the rewards of all episodes
+        env.reset(seed=reset_seed(np.random.SeedSequence(number), seed_range))
+        if not np.abs(together - reward(achieved, desired)).max() <= tolerance:
+            return _BY_GOALS, "rewards of the same goals change from episode to episode"
     lost = lost_by_rounding(reward, start, distance)
     return (_KEPT, lost) if lost else None
 
@@ -242,8 +255,8 @@ def _goals_near(first: Any) -> tuple[NDArray[Any], float, Floats, Floats]:
     The achieved goals are all that of `first`; the desired ones lie from within any threshold to
     far beyond it.
     """
-    start = np.asarray(first["achieved_goal"])
-    distance = float(np.linalg.norm(start - first["desired_goal"])) or 1.0
+    start, goal = (np.asarray(first[key], np.float64) for key in ("achieved_goal", "desired_goal"))
+    distance = float(np.linalg.norm(start - goal)) or 1.0
     achieved = np.tile(start.astype(np.float32), (_ROWS, 1))
     longest = max(1.0, distance)
     offsets = longest * random_offsets(_ROWS, len(start), 1e-3 / longest, 1.0)
@@ -382,8 +395,8 @@ def moved_distance_of(env: Env, reward: GoalReward, seed: int = 0) -> float | No
     if np.array_equal(reward(start, start + jitter), reward(start, start)):
         return None
     distance = getattr(env.unwrapped, "distance_threshold", None)
-    if isinstance(distance, int | float) and distance > 0:
-        return MOVED_SHARE * distance
+    if isinstance(distance, int | float | np.number) and distance > 0:
+        return MOVED_SHARE * float(distance)
     raise ValueError(
         "replay.hindsight_episodes must be all, or the task must have a moved_distance: "
         f"{name_of(env)} has dense rewards and no distance_threshold, so any jitter is a move"

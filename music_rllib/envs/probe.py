@@ -1,23 +1,12 @@
-"""Play environments before anything is trained, and report their problems.
-
-This is the program of a child process, since an environment may abort, end or block its process.
-`music_rllib.sweep.preflight` starts it with a folder. It reads a `Request` from the file `request`
-and appends JSON lines to the file `answers`: `["call", task, name]` before a call of an environment
-(at most once a second for repeated calls) and `["done", task, problems, remarks]` for each task.
-"""
+"""Play an environment before anything is trained, and find its problems."""
 
 from __future__ import annotations
 
 import contextlib
-import faulthandler
-import json
-import os
-import sys
 import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,6 +24,7 @@ from music_rllib.envs.make import (
     moved_distance_of,
     reset_seed,
 )
+from music_rllib.envs.played_values import Beside, PlayedValues
 from music_rllib.envs.tasks import Task, closest
 from music_rllib.envs.values import (
     GOAL_KEYS,
@@ -50,7 +40,6 @@ from music_rllib.errors import first_line, one_line
 from music_rllib.replay.buffer import GoalEnd, GoalReward
 from music_rllib.replay.trajectories import ReplayLayout
 
-REQUEST, ANSWERS = "request", "answers"
 EPISODE_SECONDS = 10.0
 """Time limit of an episode, which is cut there."""
 MOST_STEPS, MOST_SECONDS = 20_000, 2.0
@@ -71,13 +60,6 @@ class Question(BaseModel):
     task: Task
     hindsight: tuple[str, ...] = ()
     intrinsic: bool = False
-
-
-class Request(BaseModel):
-    """The tasks to play, and the maximum duration of one call in seconds."""
-
-    questions: list[Question]
-    seconds: float | None
 
 
 class RefusedError(Exception):
@@ -101,9 +83,7 @@ class Probe:
         """Other findings that a user should know."""
         self._steps = 0
         self._keys: Counter[str] = Counter()
-        self._rewards: set[float] = set()
         self._unused: set[str] = set()
-        self._types: set[str] = set()
         self._reward: GoalReward | None = None
         self._end: GoalEnd | None = None
         self._terminates = False
@@ -127,7 +107,7 @@ class Probe:
         except RefusedError as error:
             self.remarks.append(f"{error}; the exception is ignored")
 
-    def _call(self, name: str, function: Callable[..., Any], *args: Any, **options: Any) -> Any:
+    def _call(self, name: str, function: Callable[..., Any], /, *args: Any, **options: Any) -> Any:
         self._watch(name)
         try:
             return function(*args, **options)
@@ -140,12 +120,9 @@ class Probe:
 
     def _check(self, env: Env) -> None:
         task = self._task
-        try:
-            action = check_action_space(env.action_space)
-            size, goal = observation_sizes(env.observation_space)
-        except ValueError as error:
-            raise RefusedError(str(error).removeprefix("environment: ")) from None
+        action, size, goal = self._spaces(env)
         self._layout = ReplayLayout(size, int(action.shape[0]), goal, task.horizon)
+        self._values = PlayedValues(env.observation_space, size, goal)
         self.problems += beyond_observation(task.agent_indices, task.surrounding_indices, size)
         limit = env.spec.max_episode_steps if env.spec is not None else None
         if limit is not None and task.horizon > limit:
@@ -162,16 +139,31 @@ class Probe:
         self._try_seeds(env, smallest, largest)
         first = self._play(env, largest, actions=0)
         if self._hindsight and goal:
-            self._check_goals(env, smallest)
+            self._check_goals(env, task.seed_range)
         self._check_symmetries(env, smallest)
         self._play(env, smallest, actions=1, steps=REPEATED_STEPS)
-        self._repeat(env, first, largest)
+        if self._repeat(env, first, largest):
+            self._check_second(env, first, task.seed_range)
         self._play_more(env)
+        if (now := self._spaces(env)) != (action, size, goal):
+            raise RefusedError(
+                f"spaces must stay the same after reset(), got {action}, then {now[0]}"
+            )
         try:
             check_torch_type()
         except ValueError as error:
             self.problems.append(str(error))
         self._add_remarks()
+
+    def _spaces(self, env: Env) -> tuple[spaces.Box, int, int]:
+        """The action space, and the sizes of observation and goal."""
+        try:
+            return check_action_space(env.action_space), *observation_sizes(env.observation_space)
+        except ValueError as error:
+            raise RefusedError(str(error).removeprefix("environment: ")) from None
+        except Exception as error:
+            rule = "must have action_space and observation_space before reset()"
+            raise RefusedError(f"{rule}: {one_line(error)}") from error
 
     # -- calls of the environment ---------------------------------------------------------
 
@@ -213,7 +205,7 @@ class Probe:
             self._unused |= result[0].keys() | env.observation_space.keys()
         return result[0]
 
-    def _step(self, env: Env, action: Any) -> tuple[Any, Any, bool, bool, Mapping[str, Any]]:
+    def _step(self, env: Env, action: Any) -> tuple[Any, Any, bool, bool, Mapping[Any, Any]]:
         try:
             result = self._call("step()", env.step, action)
         except RefusedError as error:
@@ -228,10 +220,11 @@ class Probe:
             raise
         return _check_step(result)
 
-    def _check_goals(self, env: Env, seed: int) -> None:
+    def _check_goals(self, env: Env, seed_range: tuple[int, int]) -> None:
         self._watch(call := "compute_reward()")
+        seed, _ = seed_range
         try:
-            reward = goal_reward_of(env, seed)
+            reward = goal_reward_of(env, seed_range)
             if "moved" in self._hindsight and self._task.moved_distance is None:
                 moved_distance_of(env, reward, seed)
             self._watch(call := "compute_terminated()")
@@ -277,41 +270,72 @@ class Probe:
         last = min(steps or self._layout.horizon, self._layout.horizon)
         try:
             recording.see(observation)
-            self._compare_types(env.observation_space, observation)
+            self._values.see(observation)
             while recording.steps < last and not ended and time.monotonic() < end:
                 action = rng.uniform(-1.0, 1.0, (1, self._layout.action)).astype(np.float32)
                 result = self._step(env, to_bounds(action, space)[0])
                 observation, reward, terminated, truncated, info = result
-                self._keys.update(map(str, info))
+                self._keys.update(key for key in info if isinstance(key, str))
                 recording.step(action[0], reward, info, observation)
+                self._values.see(observation)
+                self._values.reward(reward)
                 ended = terminated or truncated
             self._steps += recording.steps
             self._terminates |= terminated
             episode = recording.finish(terminated=terminated)
         except BadNumberError as error:
             raise RefusedError(first_line(error)) from None
-        self._rewards.update(episode.rewards.tolist())
+        self._values.end(episode.frames)
         return episode
 
-    def _repeat(self, env: Env, first: Episode, seed: int) -> None:
-        """Play an episode again, and add a remark if it differs."""
+    def _differs(self, env: Env, first: Episode, seed: int) -> int | None:
+        """Play an episode again; the step from which on it differs."""
         again = self._play(env, seed, actions=0, steps=min(REPEATED_STEPS, len(first)))
         steps = min(len(again), len(first))
         differs = (again.frames[: steps + 1] != first.frames[: steps + 1]).any(axis=1)
         if differs.any() or (again.rewards[:steps] != first.rewards[:steps]).any():
-            at = int(np.argmax(differs)) if differs.any() else steps
-            self.remarks.append(
-                f"reset(seed={seed}) must determine the episode; the second time it differed from "
-                f"step {at} on. A resumed run will differ from an uninterrupted one, and runs with "
-                "the same seed will differ from each other"
-            )
+            return int(np.argmax(differs)) if differs.any() else steps
+        return None
+
+    def _repeat(
+        self, env: Env, first: Episode, seed: int, name: str = "the second time it"
+    ) -> bool:
+        """Whether an episode is the same again; a remark otherwise."""
+        if (at := self._differs(env, first, seed)) is None:
+            return True
+        self.remarks.append(
+            f"reset(seed={seed}) must determine the episode; {name} differed from step {at} on. A "
+            "resumed run will differ from an uninterrupted one, and runs with the same seed will "
+            "differ from each other"
+        )
+        return False
+
+    def _check_second(self, env: Env, first: Episode, seed_range: tuple[int, int]) -> None:
+        """Make a second environment in this process, as training does, and play both."""
+        task, (smallest, largest) = self._task, seed_range
+        try:
+            second: Env = self._call("make", make_env, task.env_id, **task.env_kwargs)
+        except RefusedError as error:
+            rule = "training and evaluation need several environments in one process"
+            raise RefusedError(f"{rule}: the second time, {error}") from error
+        if self._repeat(second, first, largest, "a second environment's"):
+            beside = Beside(env, second, smallest, generators=False)
+            if (at := self._differs(beside, first, largest)) is None:
+                beside = Beside(env, second, smallest, generators=True)
+                self._repeat(beside, first, largest, "beside a second environment it")
+            else:
+                self.problems.append(
+                    "environments in one process must not share state, as several are trained on: "
+                    f"an episode beside that of a second environment differed from step {at} on"
+                )
+        second.close()
 
     def _play_more(self, env: Env) -> None:
         """Play until the success key and, with hindsight, a second reward have been seen."""
         end, number = time.monotonic() + MOST_SECONDS, 2
         key = self._task.success_key
         while self._steps < MOST_STEPS and time.monotonic() < end:
-            rewards_differ = self._reward is None or len(self._rewards) > 1
+            rewards_differ = self._reward is None or self._values.rewards_differ
             if rewards_differ and (key is None or key in self._keys or self._misspelled()):
                 break
             seed = reset_seed(np.random.SeedSequence(number), self._task.seed_range)
@@ -319,15 +343,6 @@ class Probe:
             number += 1
 
     # -- findings -------------------------------------------------------------------------
-
-    def _compare_types(self, space: spaces.Space[Any], observation: Any) -> None:
-        """Note parts of a valid observation that are integers instead of floats, or vice versa."""
-        parts = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
-        values = observation if isinstance(space, spaces.Dict) else {"observation": observation}
-        for name in parts.keys() & {*GOAL_KEYS}:
-            returned, declared = np.asarray(values[name]).dtype, np.dtype(parts[name].dtype)
-            if returned.kind != declared.kind:
-                self._types.add(f"{name} has type {returned}, its space declares {declared}")
 
     def _misspelled(self) -> str:
         """`closest` among the keys of every step, if one is nearly the success key."""
@@ -348,11 +363,12 @@ class Probe:
                     f"success_key {key!r} was not in info in {self._steps} random steps (keys: "
                     f"{known}){closest(key, self._keys)}; a step without it counts as not reached"
                 )
+        self.problems += self._values.problems(self._task.reward_range)
+        self.remarks += self._values.remarks(hindsight=self._reward is not None)
         if self._terminates and self._reward is not None and self._end is None:
             self.remarks.append(END_AT_GOAL)
         if self._terminates and self._intrinsic:
             self.remarks.append(EARLY_END)
-        self.remarks += (f"{line}; the networks get float32" for line in sorted(self._types))
         if unused := self._unused - {*GOAL_KEYS}:
             self.remarks.append(
                 f"the observation's {', '.join(sorted(unused))} is not used: the networks get "
@@ -360,7 +376,7 @@ class Probe:
             )
 
 
-def _check_step(result: Any) -> tuple[Any, Any, bool, bool, Mapping[str, Any]]:
+def _check_step(result: Any) -> tuple[Any, Any, bool, bool, Mapping[Any, Any]]:
     """The five values of a step; RefusedError for others."""
     rule = "step() must return (observation, reward, terminated, truncated, info)"
     if not isinstance(result, tuple) or len(result) != 5:
@@ -375,44 +391,3 @@ def _check_step(result: Any) -> tuple[Any, Any, bool, bool, Mapping[str, Any]]:
     except ValueError as error:
         raise RefusedError(str(error)) from None
     return observation, reward, *ends, info
-
-
-class _Reporter:
-    """Report calls to the parent, and end this process if one takes too long."""
-
-    def __init__(self, answers: Path, seconds: float | None) -> None:
-        self._answers, self._seconds = answers.open("a"), seconds
-        self.task = self._call = ""
-        self._reported = 0.0
-
-    def __call__(self, call: str) -> None:
-        now = time.monotonic()
-        if call == self._call and now - self._reported < 1.0:
-            return
-        self._call, self._reported = call, now
-        self.write("call", self.task, call)
-        if self._seconds is not None:
-            faulthandler.dump_traceback_later(self._seconds, exit=True)
-
-    def write(self, *line: Any) -> None:
-        print(json.dumps(line), file=self._answers, flush=True)
-
-
-def main() -> None:
-    """Answer the request in the folder that the argument names."""
-    folder = Path(sys.argv[1])
-    with contextlib.suppress(OSError):  # if memory runs out, the system ends this process first
-        Path("/proc/self/oom_score_adj").write_text("1000")
-    faulthandler.enable()
-    request = Request.model_validate_json((folder / REQUEST).read_text())
-    reporter = _Reporter(folder / ANSWERS, request.seconds)
-    for question in request.questions:
-        reporter.task = question.task.name
-        probe = Probe(question, reporter)
-        probe.run()
-        reporter.write("done", question.task.name, probe.problems, probe.remarks)
-    os._exit(0)  # without waiting for threads of the environments
-
-
-if __name__ == "__main__":
-    main()

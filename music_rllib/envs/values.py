@@ -73,19 +73,20 @@ def _is_flat(space: gym.Space[Any] | None) -> bool:
 
 
 def check_action_space(space: gym.Space[Any]) -> spaces.Box:
-    """Return the space if it is a one-dimensional Box of floats within +-`LARGEST`.
+    """Return the space if it is a one-dimensional, non-empty Box of floats within +-`LARGEST`.
 
     The policy's actions fill the bounds; with placeholder bounds, nearly every action is huge.
     """
     if not (
         isinstance(space, spaces.Box)
         and _is_flat(space)
+        and space.shape[0] > 0
         and space.is_bounded("both")
         and np.issubdtype(space.dtype, np.floating)
     ):
         raise ValueError(
-            "environment: the action space must be a bounded one-dimensional Box of floats, got "
-            f"{space}"
+            "environment: the action space must be a bounded one-dimensional Box of one or more "
+            f"floats, got {space}"
         )
     if np.abs(np.array([space.low, space.high], np.float64)).max(initial=0.0) > LARGEST:
         raise ValueError(
@@ -153,9 +154,8 @@ def vector(value: Any, name: str, size: int) -> NDArray[Any]:
 
 def number_of(value: Any, name: str) -> float:
     """The number that an environment returned as `name`."""
-    if isinstance(value, float | int | np.number | np.bool_) or (
-        getattr(value, "ndim", None) == 0 and not isinstance(value, str)
-    ):
+    kind = getattr(getattr(value, "dtype", None), "kind", "f")  # a tensor's type has no kind
+    if isinstance(value, float | int) or (getattr(value, "ndim", None) == 0 and kind in "fiub"):
         try:
             return float(value)
         except (TypeError, ValueError):

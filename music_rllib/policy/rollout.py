@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 
 from music_rllib.envs.features import beyond_observation
 from music_rllib.envs.make import Env, make_env, name_of, reset_seed
-from music_rllib.envs.values import check_action_space, number_of, observation_sizes, success_of
+from music_rllib.envs.values import (
+    GOAL_KEYS,
+    check_action_space,
+    flag_of,
+    number_of,
+    observation_sizes,
+    success_of,
+)
 from music_rllib.policy.policy import Policy, PolicyError, unknown_environment
 
 
@@ -106,6 +113,7 @@ def _episode(
         try:
             total += number_of(reward, "reward")
             success = success_of(info, policy.task.success_key, missing=False)
+            ends = flag_of(terminated, "terminated") or flag_of(truncated, "truncated")
         except ValueError as error:
             place = f"{name_of(env)}, episode with seed {seed}, step {steps}"
             raise PolicyError(f"{place}: {error}") from error
@@ -113,7 +121,7 @@ def _episode(
             successes.append(success)
         if on_step:
             on_step(EpisodeStep(env, steps, success, _distance(observation)))
-        if terminated or truncated:
+        if ends:
             break
     last = _surroundings(policy, observation)
     return EpisodeResult(
@@ -137,4 +145,5 @@ def _surroundings(policy: Policy, observation: Any) -> NDArray[Any] | None:
 def _distance(observation: Any) -> float | None:
     if not isinstance(observation, dict):
         return None
-    return float(np.linalg.norm(observation["achieved_goal"] - observation["desired_goal"]))
+    achieved, desired = (np.asarray(observation[key], np.float64) for key in GOAL_KEYS[1:])
+    return float(np.linalg.norm(achieved - desired))

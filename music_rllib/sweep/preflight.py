@@ -113,7 +113,7 @@ def _play(
     questions: list[Question], hang_minutes: float | None
 ) -> list[tuple[str, list[str], list[str]]]:
     """Name, problems and remarks of the tasks that a child process played until it ended."""
-    from music_rllib.envs.probe import ANSWERS, REQUEST, Request
+    from music_rllib.envs.probe_process import ANSWERS, REQUEST, Request
 
     seconds = None if hang_minutes is None else 60 * hang_minutes
     # The child searches for modules where this process does. -P: not in the current folder first.
@@ -127,7 +127,7 @@ def _play(
         (folder / REQUEST).write_text(request.model_dump_json())
         with errors.open("wb") as stderr:
             process = subprocess.Popen(  # noqa: S603
-                [sys.executable, "-P", "-m", "music_rllib.envs.probe", temporary],
+                [sys.executable, "-P", "-m", "music_rllib.envs.probe_process", temporary],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=stderr,

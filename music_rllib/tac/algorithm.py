@@ -81,23 +81,24 @@ class TAC(Algorithm):
     def _make_replay(self) -> TrajectoryReplay:
         settings = self._settings.replay
         runner = self._runner_with_environment()
-        seed = self.config.seed_range[0]
-        goal_reward = goal_reward_of(runner.env, seed) if settings.hindsight_k > 0 else None
+        seeds, hindsight = self.config.seed_range, settings.hindsight_k > 0
+        goal_reward = goal_reward_of(runner.env, seeds) if hindsight else None
         moved_distance = self.config.moved_distance
         if goal_reward and settings.hindsight_episodes == "moved" and moved_distance is None:
-            moved_distance = moved_distance_of(runner.env, goal_reward, seed)
+            moved_distance = moved_distance_of(runner.env, goal_reward, seeds[0])
         augment = None
         if settings.symmetries:
             augment = augmentation_of(
                 self.config.task_symmetries, settings.symmetries, runner.layout, runner.env,
-                reward=goal_reward, goals=self._settings.music.goals == "environment", seed=seed,
+                reward=goal_reward, goals=self._settings.music.goals == "environment",
+                seed=seeds[0],
             )  # fmt: skip
         return TrajectoryReplay(
             runner.layout,
             settings.capacity,
             np.random.default_rng((seed_or_entropy(self.config.seed), _REPLAY_STREAM)),
             goal_reward=goal_reward,
-            goal_end=goal_end_of(runner.env, seed) if goal_reward else None,
+            goal_end=goal_end_of(runner.env, seeds[0]) if goal_reward else None,
             hindsight_k=settings.hindsight_k,
             hindsight_goals=settings.hindsight_goals,
             n_steps=settings.n_steps,

@@ -235,8 +235,9 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
         with in_environment:
             observation, reward, terminated, truncated, info = env.step(scaled)
         recording.step(action, reward, info, observation)
+        terminated, truncated = recording.ends(terminated, truncated)
         if terminated or truncated or recording.steps == self.layout.horizon:
-            return bool(terminated)
+            return terminated
         return None
 
     def _to_env(self, actions: Floats) -> Floats:

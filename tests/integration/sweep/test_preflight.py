@@ -97,7 +97,8 @@ class Loud(Point):
     def step(self, action):
         os.write(1, b"x" * 200_000)
         os.write(2, b"y" * 200_000)
-        threading.Thread(target=time.sleep, args=(3600,)).start()
+        if threading.active_count() < 50:  # faulthandler writes at most 100
+            threading.Thread(target=time.sleep, args=(3600,)).start()
         return super().step(action)
 
 class Aborts(Point):

@@ -1,7 +1,7 @@
 """Problems and remarks of environments that are played before training."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -257,3 +257,175 @@ def test_a_success_key_that_only_a_success_has_is_found(monkeypatch: pytest.Monk
 def test_a_misspelled_success_key_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     (line,) = probed(monkeypatch, Sound, success_key="is_succes").problems
     assert line.endswith("(is_success), got 'is_succes' (did you mean 'is_success'?)")
+
+
+def test_arguments_are_not_shared(monkeypatch: pytest.MonkeyPatch) -> None:
+    radii = []
+
+    class Pops(Sound):
+        def __init__(self, config: dict[str, float], name: str, function: str) -> None:
+            radii.append((config.pop("radius", None), name, function))
+
+    monkeypatch.setattr(gym.envs.registration, "registry", dict(gym.registry))
+    gym.register("Pops-v0", entry_point=lambda **given: Pops(**given), max_episode_steps=20)
+    kwargs = {"config": {"radius": 0.5}, "name": "a", "function": "b"}
+    task = Task(name="T", env_id="Pops-v0", horizon=20, env_kwargs=kwargs)
+    made = Probe(Question(task=task), lambda call: None)
+    made.run()
+    assert made.problems == []
+    assert radii == [(0.5, "a", "b")] * 2
+    assert task.env_kwargs == kwargs
+
+
+class OnlyOne(Sound):
+    made = 0
+
+    def __init__(self) -> None:
+        OnlyOne.made += 1
+        if OnlyOne.made > 1:
+            raise RuntimeError("port 5005 is in use")
+
+
+class Shared(Sound):
+    world: ClassVar[dict[str, Any]] = {}
+    at = property(lambda env: env.world["at"], lambda env, at: env.world.update(at=at))
+
+
+class NewRadius(Sound):
+    """A success radius that is drawn at each reset."""
+
+    def reset(self, **options: Any) -> Any:
+        found = super().reset(**options)
+        self.radius = self.np_random.uniform(0.05, 0.6)
+        return found
+
+    def compute_reward(self, achieved: Any, desired: Any, info: Any) -> Any:
+        return -(np.linalg.norm(achieved - desired, axis=-1) > self.radius).astype(np.float32)
+
+
+class NewBounds(Sound):
+    def reset(self, **options: Any) -> Any:
+        found = super().reset(**options)
+        self.action_space = spaces.Box(-self.np_random.uniform(1, 2), 1, (2,), np.float32)
+        return found
+
+
+class LateSpaces(Sound):
+    action_space = property(lambda env: env.bounds)
+
+    def reset(self, **options: Any) -> Any:
+        self.bounds = spaces.Box(-1, 1, (2,), np.float32)
+        return super().reset(**options)
+
+
+class NoAction(Sound):
+    action_space = spaces.Box(-1, 1, (0,), np.float32)
+
+
+class OneReward(Sound):
+    def compute_reward(self, achieved: Any, desired: Any, info: Any) -> Any:
+        return np.mean(super().compute_reward(achieved, desired, info))
+
+
+@pytest.mark.parametrize(
+    ("kind", "problem"),
+    [
+        (OnlyOne, "need several environments in one process: the second time, make must not raise"),
+        (Shared, "environments in one process must not share state, as several are trained on"),
+        (NewRadius, "rewards of the same goals change from episode to episode"),
+        (NewBounds, "spaces must stay the same after reset(), got Box(-1.0, 1.0, (2,), float32)"),
+        (LateSpaces, "must have action_space and observation_space before reset()"),
+        (NoAction, "must be a bounded one-dimensional Box of one or more floats"),
+        (OneReward, "256 goals have rewards of shape ()"),
+    ],
+)
+def test_an_environment_whose_numbers_would_be_wrong_is_refused(
+    kind: type[Sound], problem: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (line,) = probed(monkeypatch, kind, hindsight=True).problems
+    assert problem in line
+
+
+class Holds(Sound):
+    def seen(self) -> Any:
+        return super().seen() | {"observation": np.array([self.at[0], self.goal[1] - self.at[1]])}
+
+
+class FarAway(Sound):
+    def seen(self) -> Any:
+        return super().seen() | {"observation": self.at + np.array([5.4e6, 0])}
+
+
+class Drawn(Sound):
+    """The size of a step is drawn when the environment is made."""
+
+    def __init__(self) -> None:
+        self.size = np.random.default_rng().uniform(0.5, 1.0)
+
+    def step(self, action: Any) -> Any:
+        return super().step(self.size * action)
+
+
+class GlobalGenerator(Sound):
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        np.random.seed(seed)  # noqa: NPY002
+        return super().reset(seed=seed)
+
+    def step(self, action: Any) -> Any:
+        return super().step(action + np.random.uniform(-0.1, 0.1, 2))  # noqa: NPY002
+
+
+@pytest.mark.parametrize(
+    ("kind", "remark"),
+    [
+        (GlobalGenerator, "beside a second environment it differed from step 1 on"),
+        (Holds, "observation[1] holds desired_goal[1] or its distance from the achieved goal"),
+        (FarAway, "observation[0] changes too little for its size: float32"),
+        (Drawn, "a second environment's differed from step 1 on"),
+        (
+            changed(lambda env, seen, reward, *rest: (seen, 1e9 - abs(env.at[0]), *rest)),
+            "rewards change too little for their size: float32",
+        ),
+    ],
+)
+def test_values_that_networks_cannot_learn_from_are_remarks(
+    kind: type[Sound], remark: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = probed(monkeypatch, kind, hindsight=kind is Holds)
+    assert made.problems == []
+    (line,) = made.remarks
+    assert remark in line
+
+
+def test_a_reward_range_contains_the_rewards_that_are_played(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert probed(monkeypatch, Sound, reward_range=(-1, 0)).problems == []
+    (line,) = probed(monkeypatch, Sound, reward_range=(-0.5, 0)).problems
+    assert line.startswith("reward_range must contain every reward, got [-0.5, 0]: random steps")
+
+
+def test_bool_goals_are_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Bools(Sound):
+        goals = spaces.Box(0, 1, (2,), bool)  # type: ignore[arg-type]
+        observation_space = spaces.Dict(
+            {
+                "observation": spaces.Box(-9, 9, (2,)),
+                "achieved_goal": goals,
+                "desired_goal": goals,
+            }
+        )
+
+        def seen(self) -> Any:
+            goals = {"achieved_goal": self.at > 0, "desired_goal": self.goal > 0}
+            return {"observation": self.at, **goals}
+
+        def compute_reward(self, achieved: Any, desired: Any, info: Any) -> Any:
+            return -(np.asarray(achieved) != np.asarray(desired)).any(axis=-1).astype(np.float32)
+
+        def step(self, action: Any) -> Any:
+            seen, *_, info = super().step(action)
+            reward = self.compute_reward(seen["achieved_goal"], seen["desired_goal"], {})
+            return seen, float(reward), False, False, info
+
+    assert probed(monkeypatch, Bools, hindsight=True).problems == []
