@@ -9,7 +9,7 @@ this name, the table has all its runs that any export in docs/results/data has, 
 trained them; otherwise it has the runs of the export docs/results/data/NAME. KIND is
 
 - without NAME, over the studies of `summary.STUDIES`: `headline`, `differences`, `summary`,
-  `sampled`, `one-family`, `collapses`, `exploration` or `robustness`;
+  `sampled`, `one-family`, `collapses`, `exploration`, `robustness` or `least-stable`;
 - for a planned study: `answer`, `outcomes` (with stages), `seeds`, `cells`, `figure` (with its
   name), `learning`, `arms`, `peers`, `equal-total`, `hours` or `progress`;
 - for any sweep: `totals` (with a pretrained stage and one from scratch), `runs`, `provenance`,
@@ -28,7 +28,7 @@ from pathlib import Path
 from docs.result_pages.exploration import exploration_table
 from docs.result_pages.exports import hours_text, progress_text, sweep_called
 from docs.result_pages.learning import learning_figure, overview, peers_figure
-from docs.result_pages.robustness import robustness_list
+from docs.result_pages.robustness import least_stable, robustness_list
 from docs.result_pages.runs import metric_table, provenance, runs_table
 from docs.result_pages.searches import search_text
 from docs.result_pages.studies import (
@@ -97,6 +97,7 @@ def page(name: str, figures: dict[str, Drawing]) -> str:
         "collapses": collapses,
         "exploration": lambda: "\n".join(exploration_table()),
         "robustness": lambda: "\n".join(robustness_list()),
+        "least-stable": least_stable,
         "equal-total": equal_total_text,
         "progress": progress_text,
         "hours": hours_text,
