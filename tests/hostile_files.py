@@ -41,6 +41,16 @@ SPACES = Spaces(observation_size=INPUTS, goal_size=0, action_low=(-2.0,), action
 PENDULUM = Task(name="Pendulum", env_id="Pendulum-v1", horizon=20, success_key=None)
 
 
+class Bomb:
+    """An object that creates a file when it is unpickled."""
+
+    def __init__(self, target: Path) -> None:
+        self.target = target
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (Path.touch, (self.target,))
+
+
 def write_policy(folder: Path, task: Task) -> Path:
     """A handoff with weights for the spaces of Pendulum, for any task."""
     run = RunSettings.model_validate(

@@ -13,7 +13,6 @@ import io
 import json
 import os
 import re
-import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -22,6 +21,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any
+
+from tests.processes import fresh
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "architecture.md"
@@ -101,26 +102,17 @@ def trace_loss(called: Called, folder: Path) -> None:
 
 def trace_weights(called: Called, folder: Path) -> None:
     """A handoff through the storage."""
-    import numpy as np
-
-    from music_rllib.config.run_settings import RunSettings, variant_music
-    from music_rllib.envs.tasks import BUILT_IN_TASKS
-    from music_rllib.store.handoff import read_handoff, write_handoff
+    from music_rllib.store.handoff import read_handoff
     from music_rllib.store.node_store import NodeStore
-    from tests.hostile_files import SPACES
+    from tests.handoffs import music_u, write_estimator
 
-    task = BUILT_IN_TASKS["FetchPush"]
-    music = variant_music("music-u", task)
-    run = RunSettings.model_validate(
-        {"task": task, "variant": "music-u", "seed": 0, "music": music}
-    )
-    weights = {"mi_estimator": {"w": np.zeros((4, 4), np.float32)}}
+    run = music_u()
     with called.recording():
-        write_handoff(folder / "made/handoff", weights, run.handoff_info("0" * 20, 1, SPACES))
+        write_estimator(folder / "made/handoff", run)
         store = NodeStore(str(folder))
         store.publish("0" * 20, folder / "made")
         store.fetch("0" * 20, folder / "fetched")
-        read_handoff(folder / "fetched/handoff", ["mi_estimator"], task)
+        read_handoff(folder / "fetched/handoff", ["mi_estimator"], run.task)
 
 
 def trace_search(called: Called, folder: Path) -> None:
@@ -282,15 +274,8 @@ def observed(journey: str) -> list[str]:
     """The functions of a journey in the order of their first call, in a process of its own."""
     kept = ("PATH", "HOME", "LANG", "TMPDIR", "VIRTUAL_ENV")
     environment = {name: os.environ[name] for name in kept if name in os.environ}
-    done = subprocess.run(
-        [sys.executable, "-m", "tests.journeys", "--trace", journey],
-        cwd=ROOT,
-        env=environment | {"PYTHONPATH": str(ROOT), "MPLBACKEND": "agg"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    environment |= {"PYTHONPATH": str(ROOT), "MPLBACKEND": "agg"}
+    done = fresh("-m", "tests.journeys", "--trace", journey, cwd=ROOT, env=environment)
     functions: list[str] = json.loads(done.stdout.splitlines()[-1])
     return functions
 
@@ -306,9 +291,7 @@ def driver_modules() -> int:
         "import sys, music_rllib.sweep.driver\n"
         "print(sum(name.partition('.')[0] == 'music_rllib' for name in sys.modules))"
     )
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    return int(done.stdout)
+    return int(fresh("-c", code, cwd=ROOT).stdout)
 
 
 def section() -> str:

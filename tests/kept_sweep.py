@@ -6,19 +6,16 @@ import json
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from music_rllib.config.load import load_config
 from music_rllib.experiment.open_sweep import open_sweep
 from music_rllib.experiment.plan import make_plan
 from music_rllib.experiment.record import keep_record
+from tests.sweep_files import loaded
 
 __all__ = ["kept_sweep"]
 
 
 def kept_sweep(storage: Path, tracking_uri: str | None = None, **settings: Any) -> Path:
     """The folder of a tracked sweep `s`, with its whole record except for passwords."""
-    file = storage / "s.yaml"
     stages = [{"name": "train", "variant": "tac"}]
     document = {
         "name": "s",
@@ -28,8 +25,7 @@ def kept_sweep(storage: Path, tracking_uri: str | None = None, **settings: Any) 
         "storage": "elsewhere",
         **settings,
     }
-    file.write_text(yaml.safe_dump(document))
-    config = load_config(file)
+    config = loaded(storage, document)
     folder = storage / "s"
     keep_record(open_sweep(config, make_plan(config), str(storage)))
     record = {"sweep_name": "s", "sweep_id": "0", "tracking_uri": tracking_uri, "run_id": "1"}

@@ -9,10 +9,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from music_rllib import names
-from music_rllib.config.load import load_config
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.experiment.open_sweep import OpenSweep, open_sweep
 from music_rllib.experiment.plan import Node, make_plan
@@ -23,6 +20,7 @@ from music_rllib.search.searches import open_searches
 from music_rllib.store.history import HISTORY, Report, RunResult, last_values, to_json_lines
 from music_rllib.store.lease import Lease, LeaseFile
 from music_rllib.tune.runner import DagSearcher, SharedRuns
+from tests.sweep_files import loaded
 
 Document = dict[str, Any]
 Formula = Callable[[RunSettings, float], float]
@@ -79,9 +77,7 @@ class Driver:
         `change` is called with the sweep before it begins.
         """
         folder.mkdir(exist_ok=True)
-        path = folder / "sweep.yaml"
-        path.write_text(yaml.safe_dump(content, sort_keys=False))
-        config = load_config(path, storage=str(folder / "results"))
+        config = loaded(folder, content, storage=str(folder / "results"))
         plan = make_plan(config)
         self.sweep: OpenSweep = change(open_sweep(config, plan, config.storage))
         self.computed: list[str] = []

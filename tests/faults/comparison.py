@@ -10,6 +10,7 @@ from mlflow import MlflowClient
 
 from music_rllib import names
 from music_rllib.store.node_store import NodeStore
+from tests.integration.conftest import runs_by_name
 
 Numbers = dict[str, list[tuple[int, dict[str, float]]]]
 
@@ -46,11 +47,8 @@ def without_machine(metrics: dict[str, float]) -> dict[str, float]:
 def logged(tracking_uri: str, experiment: str = "points") -> Numbers:
     """Run name to its metrics in MLflow, by step; fails if a step occurs twice."""
     client = MlflowClient(tracking_uri)
-    found = client.get_experiment_by_name(experiment)
-    assert found is not None
-    runs = client.search_runs([found.experiment_id])
-    assert len({run.info.run_name for run in runs}) == len(runs), "a run occurs twice"
-    return {run.info.run_name: _steps(client, run) for run in runs if _is_of_a_node(run)}
+    runs = runs_by_name(client, experiment)
+    return {name: _steps(client, run) for name, run in runs.items() if _is_of_a_node(run)}
 
 
 def _is_of_a_node(run: Any) -> bool:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import sys
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +13,8 @@ from typing import Any
 import psutil
 import yaml
 
-from tests.integration.conftest import SWEEP, Program, end, program_environment
+from tests.integration.conftest import SWEEP, Program, end, program_environment, read_until
+from tests.processes import fresh, wait_until
 
 FIRST_SIGN = 400.0
 """Timeout of a start on a busy machine, in seconds."""
@@ -61,15 +60,11 @@ def start_until(program: Program, *signs: str) -> subprocess.Popen[str]:
     return process
 
 
-def read_until(process: subprocess.Popen[str], *signs: str) -> str:
-    """Read until a line contains one of `signs`; returns the lines."""
-    assert process.stdout is not None
-    deadline, seen = time.monotonic() + FIRST_SIGN, []
-    for line in process.stdout:
-        seen.append(line)
-        if any(sign in line for sign in signs) or time.monotonic() > deadline:
-            break
-    return "".join(seen)
+def ended(process: subprocess.Popen[str], code: int = 0) -> str:
+    """Wait for the end with this exit code; returns the rest of the output."""
+    output, errors = process.communicate(timeout=PATIENCE)
+    assert process.returncode == code, output + errors
+    return output
 
 
 def kill(process: subprocess.Popen[str]) -> None:
@@ -90,13 +85,8 @@ def workers(process: subprocess.Popen[str]) -> Iterator[psutil.Process]:
 
 def kill_a_worker(process: subprocess.Popen[str]) -> None:
     """`kill -9` a worker as soon as one is training."""
-    deadline = time.monotonic() + FIRST_SIGN
-    while time.monotonic() < deadline:
-        for worker in workers(process):
-            os.kill(worker.pid, signal.SIGKILL)
-            return
-        time.sleep(0.1)
-    raise AssertionError("no worker came up")
+    worker = wait_until(lambda: next(workers(process), None), FIRST_SIGN)
+    os.kill(worker.pid, signal.SIGKILL)
 
 
 def finish(program: Program, timeout: float = PATIENCE) -> str:
@@ -108,13 +98,7 @@ def finish(program: Program, timeout: float = PATIENCE) -> str:
 
 def resume(program: Program, code: int = 0) -> str:
     """The command that a sweep names when MLflow lacks records; returns its output."""
-    done = subprocess.run(
-        [sys.executable, "-m", "music_rllib.sweep", "resume", "results/points"],
-        cwd=program.folder,
-        env=program.environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == code, done.stdout + done.stderr
+    command = ("-m", "music_rllib.sweep", "resume", "results/points")
+    place: Any = {"cwd": program.folder, "env": program.environment}
+    done = fresh(*command, code=code, timeout=PATIENCE, **place)
     return done.stdout + done.stderr

@@ -10,14 +10,11 @@ from typing import Any
 from unittest.mock import MagicMock
 
 import pytest
-import yaml
 from ray import ObjectRef
 from ray.air.execution._internal.actor_manager import RayActorManager
 from ray.tune import PlacementGroupFactory
 from ray.tune.search import Searcher
 
-from music_rllib.config.load import load_config
-from music_rllib.config.schema import SweepConfig
 from music_rllib.errors import BadInputError
 from music_rllib.experiment.open_sweep import OpenSweep, continued_runs_text, open_sweep
 from music_rllib.experiment.plan import Node, continuation_key, make_plan
@@ -29,16 +26,14 @@ from music_rllib.store.lease import Lease, LeaseFile
 from music_rllib.store.storage import open_storage
 from music_rllib.sweep.driver_lock import alone, driving
 from music_rllib.tune.runner import DagSearcher, SharedRuns, _forget_ended
+from tests.sweep_files import loaded
 
 RESULT = RunResult(label="l", env_steps=1200, seconds=1.0, metrics={})
 
 
 def opened(folder: Path, document: dict[str, Any]) -> OpenSweep:
-    path = folder / "sweep.yaml"
-    path.write_text(yaml.safe_dump(document, sort_keys=False))
-    config: SweepConfig = load_config(path)
-    storage = folder / "results"
-    return open_sweep(config, make_plan(config), str(storage))
+    config = loaded(folder, document)
+    return open_sweep(config, make_plan(config), str(folder / "results"))
 
 
 def finish(sweep: OpenSweep, folder: Path, *labels: str) -> None:

@@ -10,10 +10,8 @@ import json
 import pickle
 import shutil
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -23,6 +21,7 @@ from music_rllib.store.lease import Lease
 from music_rllib.store.node_store import NodeStore
 from music_rllib.training.job import NodeJob
 from music_rllib.training.worker import CAUSE, LEFT, NOTES, STOPPED, RunTrainable
+from tests.hostile_files import Bomb
 from tests.integration.sweep.test_sweep_trainable import (
     compute,
     job,
@@ -31,6 +30,7 @@ from tests.integration.sweep.test_sweep_trainable import (
     point_environment,
     settings,
 )
+from tests.processes import fresh
 
 __all__ = ["nothing_in_the_home_folder", "point_environment"]
 
@@ -47,16 +47,6 @@ def cut(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, NodeJob]:
     node = job(broken, settings("tac"))
     compute(node, steps=3)
     return whole, broken, node
-
-
-class Bomb:
-    """An object that creates a file when it is unpickled."""
-
-    def __init__(self, target: Path) -> None:
-        self.target = target
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return (Path.touch, (self.target,))
 
 
 def flip(path: Path) -> None:
@@ -313,12 +303,7 @@ def test_a_kill_at_any_step_of_saving_leaves_an_intact_checkpoint(tmp_path: Path
         return folder
 
     def save(number: int) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, "-c", KILLED_WHILE_SAVING, str(storage(number)), str(number)],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+        return fresh("-c", KILLED_WHILE_SAVING, storage(number), number, code=None)
 
     steps = int(save(0).stdout)
     assert steps > 10

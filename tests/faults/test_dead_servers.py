@@ -49,8 +49,7 @@ def test_a_server_that_is_away_for_a_minute(
     time.sleep(60.0)
     server.start()
     server.wait()
-    output, _ = process.communicate(timeout=sweeps.PATIENCE)
-    assert process.returncode == 0, output
+    output = sweeps.ended(process)
     if "did not reach MLflow" in output:  # the sweep ended before the server returned
         resume(program)
     same(unbroken, program, server.uri)
@@ -60,8 +59,7 @@ def test_a_server_that_stays_away(program: Program, unbroken: Path, server: Mlfl
     program.write(sweeps.document(mlflow={"tracking_uri": server.uri}))
     process = sweeps.start_until(program, "pretrain/seed0: started")
     server.signal(signal.SIGKILL)
-    output, _ = process.communicate(timeout=sweeps.PATIENCE)
-    assert process.returncode == 0, output
+    output = sweeps.ended(process)
     assert f"did not reach MLflow at {server.uri}" in output
     assert "music-rllib resume" in output
     server.start()
@@ -77,8 +75,7 @@ def test_a_server_that_answers_500(program: Program, unbroken: Path, server: Mlf
     process = sweeps.start_until(program, "pretrain/seed0: started")
     server.signal(signal.SIGKILL)
     with refusing(500, server.port):
-        output, errors = process.communicate(timeout=sweeps.PATIENCE)
-        assert process.returncode == 0, output + errors
+        output = sweeps.ended(process)
         assert f"did not reach MLflow at {server.uri}" in output
         assert TODO[500] in output
         assert TODO[500] in resume(program, code=2)
@@ -113,8 +110,7 @@ def test_a_password_that_is_changed(
         timeout=60,
     )
     assert changed.ok, changed.text
-    output, errors = process.communicate(timeout=sweeps.PATIENCE)
-    assert process.returncode == 0, output + errors
+    output = sweeps.ended(process)
     assert f"did not reach MLflow at {mlflow_server}" in output
     assert TODO[401] in output
     assert TODO[401] in resume(program, code=2)

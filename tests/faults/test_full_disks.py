@@ -113,8 +113,7 @@ def test_a_disk_that_fills_up_during_a_sweep(
     program.write(sweeps.document(storage=str(disk / "results")))
     process = sweeps.start_until(program, "pretrain/seed0: 4", "pretrain/seed0: 8")
     ballast = fill(disk)
-    output, errors = process.communicate(timeout=sweeps.PATIENCE)
-    assert process.returncode == 1, output + errors
+    output = sweeps.ended(process, 1)
     assert "pretrain/seed0: FAILED: StorageError: " in output
     assert f"{disk}/results" in output
     assert "must be writable: No space left on device" in output
@@ -131,8 +130,7 @@ def test_a_full_disk_below_mlflow(program: Program, unbroken: Path, small_disk: 
     program.write(sweeps.document(mlflow={"tracking_uri": uri}))
     process = sweeps.start_until(program, "pretrain/seed0: started")
     ballast = fill(disk)
-    output, errors = process.communicate(timeout=sweeps.PATIENCE)
-    assert process.returncode == 0, output + errors
+    output = sweeps.ended(process)
     assert "did not reach MLflow" in output
     assert "music-rllib resume" in output
     ballast.unlink()

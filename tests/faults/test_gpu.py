@@ -5,8 +5,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -26,6 +24,7 @@ from tests.integration.algorithm.test_tac_algorithm import (
     fingerprint,
     register_uneven,
 )
+from tests.processes import fresh
 
 pytestmark = pytest.mark.gpu
 
@@ -55,8 +54,8 @@ def same_random_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
         def drawn(*size: Any, generator: Any = None, device: Any = None, **options: Any) -> Tensor:
             if generator is None or generator.device.type == "cpu":
                 return draw(*size, generator=generator, device=device, **options)
-            fresh = torch.Generator().manual_seed(generator.initial_seed())
-            twin = twins.setdefault(id(generator), fresh)
+            new = torch.Generator().manual_seed(generator.initial_seed())
+            twin = twins.setdefault(id(generator), new)
             return draw(*size, generator=twin, **options).to(generator.device)
 
         return drawn
@@ -122,8 +121,5 @@ def test_a_sweep_with_two_runs_on_a_gpu_is_killed_resumed_and_read_without_one(
     assert output.count("finished earlier, reused") == 3
     for program in (unbroken, cut):
         program.end_all()
-    played = subprocess.run(
-        [sys.executable, "-m", "music_rllib", "evaluate", "finetune/q=2/seed0", "--json"],
-        cwd=cut.folder, env=cut.environment, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert played.returncode == 0, played.stdout + played.stderr
+    play = ("-m", "music_rllib", "evaluate", "finetune/q=2/seed0", "--json")
+    fresh(*play, cwd=cut.folder, env=cut.environment)

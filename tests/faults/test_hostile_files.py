@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.hostile_files import CORPUS, MEGABYTES, SECONDS
+from tests.processes import fresh
 
 ROOT = Path(__file__).parents[2]
 
@@ -19,15 +18,7 @@ ROOT = Path(__file__).parents[2]
 def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]:
     """The result of the programs for each file of the corpus."""
     folder = tmp_path_factory.mktemp("corpus")
-    done = subprocess.run(
-        [sys.executable, "-m", "tests.hostile_files", str(folder)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=280,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    done = fresh("-m", "tests.hostile_files", folder, cwd=ROOT)
     results = [json.loads(line) for line in done.stdout.splitlines()]
     return {result["name"]: result for result in results}
 

@@ -16,7 +16,8 @@ import pytest
 from music_rllib.program import main
 from music_rllib.tune.events import RESTARTS
 from tests.faults import comparison, sweeps
-from tests.integration.conftest import Program, call
+from tests.integration.conftest import Program, call, read_until
+from tests.processes import wait_until
 
 
 @pytest.mark.thorough
@@ -26,12 +27,11 @@ def test_a_killed_worker_then_sigterm_then_a_killed_driver(
     """Kill in pretraining, after the handoff, and after the resume."""
     process = sweeps.start_until(program, "pretrain/seed0: started")
     sweeps.kill_a_worker(process)
-    output = sweeps.read_until(process, ": FAILED", "finetune/q=1/seed0: s")
+    output = read_until(process, ": FAILED", "finetune/q=1/seed0: s")
     assert "The worker process died" in output
     assert f"Another worker resumes from the last checkpoint (1 of {RESTARTS} times)." in output
     process.send_signal(signal.SIGTERM)
-    output, errors = process.communicate(timeout=sweeps.PATIENCE)
-    assert process.returncode == 128 + signal.SIGTERM, output + errors
+    output = sweeps.ended(process, 128 + signal.SIGTERM)
     assert "continue with: python -m music_rllib.sweep" in output
 
     process = sweeps.start_until(program, "finetune", "Results of")
@@ -69,8 +69,7 @@ def test_a_signal_to_the_process_group_changes_no_number(program: Program, unbro
     process = sweeps.start_until(program, "pretrain/seed0: started")
     time.sleep(1.0)
     os.killpg(process.pid, signal.SIGTERM)
-    output, errors = process.communicate(timeout=sweeps.PATIENCE)
-    assert process.returncode == 128 + signal.SIGTERM, output + errors
+    output = sweeps.ended(process, 128 + signal.SIGTERM)
     assert "Ray was told to stop as well" in output
     assert "continue with: python -m music_rllib.sweep" in output
     sweeps.finish(program)
@@ -81,7 +80,7 @@ def test_a_signal_to_the_process_group_changes_no_number(program: Program, unbro
 def test_a_second_signal_ends_it_at_once(program: Program, unbroken: Path) -> None:
     process = sweeps.start_until(program, "pretrain/seed0: started")
     process.send_signal(signal.SIGINT)
-    sweeps.read_until(process, "stopping, this takes a few seconds")
+    read_until(process, "stopping, this takes a few seconds")
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=sweeps.PATIENCE)
     assert process.returncode == 128 + signal.SIGINT
@@ -103,11 +102,10 @@ def test_a_run_whose_worker_dies_repeatedly_fails_with_the_cause(
         sweeps.kill_a_worker(process)
         last = "The same command again continues from the last checkpoint"
         sign = last if attempt == RESTARTS else "] seed0: started"
-        output = sweeps.read_until(process, sign)
+        output = read_until(process, sign)
     assert ": FAILED: The worker process died" in output
     assert last in output
-    output, errors = process.communicate(timeout=sweeps.PATIENCE)
-    assert process.returncode == 1, output + errors
+    sweeps.ended(process, 1)
 
 
 @pytest.mark.thorough
@@ -166,13 +164,11 @@ def test_an_array_of_tasks_is_stopped_killed_and_requeued(
 
     def with_sign(sign: str) -> int:
         """The task whose log has `sign`."""
-        deadline = time.monotonic() + sweeps.FIRST_SIGN
-        while time.monotonic() < deadline:
-            for log in tmp_path.glob("*.log"):
-                if sign in log.read_text():
-                    return int(log.stem)
-            time.sleep(0.1)
-        raise AssertionError(f"no {sign} in {tmp_path}")
+
+        def found() -> list[int]:
+            return [int(log.stem) for log in tmp_path.glob("*.log") if sign in log.read_text()]
+
+        return wait_until(found, sweeps.FIRST_SIGN)[0]
 
     tasks = {number: task(number) for number in (1, 2, 3)}
     try:

@@ -13,7 +13,7 @@ import pytest
 
 from music_rllib.search import searches
 from tests.faults import comparison, sweeps
-from tests.integration.conftest import Program
+from tests.integration.conftest import Program, read_until
 from tests.played_search import Driver, document, searched
 
 
@@ -60,9 +60,8 @@ def test_a_locked_mlflow_delays_no_run_and_has_each_step_once(
     results = program.folder / "results"
     process = sweeps.start_until(program, "pretrain/seed0: started")
     with locked(results / "mlflow.db"):
-        sweeps.read_until(process, "pretrain/seed0: finished")
+        read_until(process, "pretrain/seed0: finished")
         time.sleep(10.0)
-    output, errors = process.communicate(timeout=sweeps.PATIENCE)
-    assert process.returncode == 0, output + errors
+    output = sweeps.ended(process)
     assert "did not reach MLflow" not in output
     comparison.same(unbroken, results)

@@ -14,7 +14,8 @@ import psutil
 import pytest
 
 from tests.faults import comparison, sweeps
-from tests.integration.conftest import Program
+from tests.integration.conftest import Program, read_until
+from tests.processes import wait_until
 
 pytestmark = pytest.mark.thorough
 
@@ -56,13 +57,11 @@ def test_a_suspended_sweep_leaves_its_run_to_the_new_owner(
     signal_all(process, signal.SIGSTOP)
     let_expire(lease)
     second = other.start("--name", "second")
-    sweeps.read_until(second, "pretrain/seed0: ")
+    read_until(second, "pretrain/seed0: ")
     signal_all(process, signal.SIGCONT)
-    output, errors = process.communicate(timeout=sweeps.PATIENCE)
-    assert process.returncode == 0, output + errors
+    output = sweeps.ended(process)
     assert "pretrain/seed0: another process took over while this one was suspended" in output
-    output, errors = second.communicate(timeout=sweeps.PATIENCE)
-    assert second.returncode == 0, output + errors
+    sweeps.ended(second)
     comparison.same(unbroken, tmp_path / "results")
     theirs = comparison.logged(f"sqlite:///{other.folder}/mlflow.db", "second")
     assert theirs == comparison.logged(f"sqlite:///{unbroken}/mlflow.db")
@@ -70,8 +69,4 @@ def test_a_suspended_sweep_leaves_its_run_to_the_new_owner(
 
 def wait_for_lease(storage: Path) -> list[Path]:
     """The lease of the run, which its worker acquires in the first step."""
-    deadline = time.monotonic() + sweeps.FIRST_SIGN
-    while not (found := list((storage / "work").glob("*/lease.json"))):
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-    return found
+    return wait_until(lambda: [*(storage / "work").glob("*/lease.json")], sweeps.FIRST_SIGN)

@@ -96,16 +96,22 @@ class Program:
     def start_until(self, wanted: str, timeout: float = 120) -> subprocess.Popen[str]:
         """Start it and wait for a line that contains `wanted`."""
         process = self.start()
-        assert process.stdout is not None
-        deadline, seen = time.monotonic() + timeout, []
-        for line in process.stdout:
-            seen.append(line)
-            if wanted in line:
-                return process
-            if time.monotonic() > deadline:
-                break
+        seen = read_until(process, wanted, timeout=timeout)
+        if wanted in seen:
+            return process
         end(process)
-        pytest.fail(f"no {wanted!r} in:\n{''.join(seen)}{process.communicate()[1]}")
+        pytest.fail(f"no {wanted!r} in:\n{seen}{process.communicate()[1]}")
+
+
+def read_until(process: subprocess.Popen[str], *signs: str, timeout: float = 400) -> str:
+    """Read until a line contains one of `signs`, or for `timeout` seconds; returns the lines."""
+    assert process.stdout is not None
+    deadline, seen = time.monotonic() + timeout, []
+    for line in process.stdout:
+        seen.append(line)
+        if any(sign in line for sign in signs) or time.monotonic() > deadline:
+            break
+    return "".join(seen)
 
 
 def call(
@@ -174,11 +180,16 @@ def mlflow_runs_of(folder: Path, database: str = "results/mlflow.db") -> dict[st
     """All runs in MLflow's database of a sweep in `folder`, by name."""
     from mlflow import MlflowClient
 
-    client = MlflowClient(f"sqlite:///{folder}/{database}")
-    (experiment,) = [e for e in client.search_experiments() if e.name == "points"]
-    found = client.search_runs([experiment.experiment_id])
-    by_name = {run.info.run_name: run for run in found}
-    assert len(by_name) == len(found), "a run is there twice"
+    return runs_by_name(MlflowClient(f"sqlite:///{folder}/{database}"))
+
+
+def runs_by_name(client: Any, experiment: str = "points") -> dict[str, Any]:
+    """All runs of an experiment in MLflow, by name; fails if a name occurs twice."""
+    found = client.get_experiment_by_name(experiment)
+    assert found is not None
+    runs = list(client.search_runs([found.experiment_id]))
+    by_name = {run.info.run_name: run for run in runs}
+    assert len(by_name) == len(runs), sorted(run.info.run_name for run in runs)
     return by_name
 
 

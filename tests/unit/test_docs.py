@@ -18,25 +18,6 @@ PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md")), *sorted(DOCS.glob("lab/
 TEXTS = {path.name: path.read_text(encoding="utf-8") for path in PAGES}
 
 
-def blocks(text: str, language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
-
-
-EXAMPLES = [
-    pytest.param(block, id=f"{name}-{position}")
-    for name, text in TEXTS.items()
-    for position, block in enumerate(blocks(text, "yaml"))
-    if re.search(r"^stages:", block, re.MULTILINE)
-]
-
-
-@pytest.mark.parametrize("example", EXAMPLES)
-def test_sweeps_in_the_documentation_are_valid(example: str, tmp_path: Path) -> None:
-    path = tmp_path / "example.yaml"
-    path.write_text(example, encoding="utf-8")
-    assert load_config(path).stages
-
-
 def anchors(text: str) -> set[str]:
     """Anchors of a page's headings, as GitHub creates them."""
     headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)

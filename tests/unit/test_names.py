@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 from mlflow.utils.validation import _validate_metric_name
 
 from music_rllib import names
+from tests.processes import fresh
 
 CONSTANTS = {
     key: value for key, value in vars(names).items() if key.isupper() and isinstance(value, str)
@@ -31,5 +29,4 @@ def test_names_load_neither_mlflow_nor_ray_nor_torch() -> None:
         "import sys; import music_rllib.names, music_rllib.tracking.store; "
         "print(sorted({'mlflow', 'ray', 'torch', 'matplotlib', 'requests'} & set(sys.modules)))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    assert fresh("-c", code).stdout.strip() == "[]"

@@ -21,6 +21,7 @@ from music_rllib import __version__
 from music_rllib.config.document import SCHEMA
 from music_rllib.config.load import load_config
 from music_rllib.program import app, main
+from tests.processes import fresh
 
 REPOSITORY = Path(__file__).parents[2]
 PROGRAMS = ("music-rllib", "music_rllib.sweep")
@@ -80,14 +81,8 @@ sys.stdout = sys.__stdout__
 print(raw.buffer.getvalue().decode("ascii"))
 """
     calls = json.dumps([["plan"], ["run"], ["compare"], ["report"], ["status"], ["best"]])
-    done = subprocess.run(
-        [sys.executable, "-c", code, calls],
-        cwd=folder,
-        env=os.environ | {"PYTHONIOENCODING": "ascii", "PYTHONPATH": str(REPOSITORY)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    environment = os.environ | {"PYTHONIOENCODING": "ascii", "PYTHONPATH": str(REPOSITORY)}
+    done = fresh("-c", code, calls, cwd=folder, env=environment)
     assert "\\u03b1 \\u2265 1" in done.stdout
     assert '"\\u03b1": 1' in done.stdout
     assert "Traceback" not in done.stderr
@@ -144,14 +139,7 @@ def test_help_and_version_load_nothing_heavy(tmp_path: Path) -> None:
         f"loaded = {HEAVY!r} & set(sys.modules)\n"
         "assert not loaded, loaded\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code, json.dumps(calls)],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    done = fresh("-c", code, json.dumps(calls), cwd=tmp_path)
     assert f"music-rllib {__version__}\n" in done.stdout
 
 
@@ -254,14 +242,8 @@ def test_the_schema_accepts_shipped_sweeps_and_rejects_unknown_names(
     "program", ["music_rllib plan", "music_rllib.sweep", "music_rllib.sweep --name other"]
 )
 def test_it_runs_as_a_module_from_any_folder(program: str, tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", *program.split(), "tac.alpha=-1"],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert (done.returncode, done.stdout) == (2, "")
+    environment = os.environ | {"PYTHONPATH": str(REPOSITORY)}
+    done = fresh("-m", *program.split(), "tac.alpha=-1", code=2, cwd=tmp_path, env=environment)
+    assert done.stdout == ""
     assert done.stderr == "error: command line: tac.alpha must be >= 0, got -1\n"
     assert list(tmp_path.iterdir()) == []

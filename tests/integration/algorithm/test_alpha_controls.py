@@ -14,22 +14,17 @@ from ray.rllib.policy.sample_batch import MultiAgentBatch, SampleBatch
 
 from music_rllib import names
 from music_rllib.functional.entropy_scale import matched_alpha, normalised_alpha
-from music_rllib.tac.algorithm import TACConfig, _determinism_without_compiler
 from music_rllib.tac.learner import TACLearner
+from tests.integration.algorithm.test_tac_losses import small_learner
 
 ACTIONS, BATCH = 2, 32
 RAMP = {"schedule": "linear", "start": 1.0, "end": 3.0, "begin": 0.0, "finish": 1.0}
 
 
 def learner(**settings: Any) -> TACLearner:
-    spaces = (gym.spaces.Box(-1.0, 1.0, (1,)), gym.spaces.Box(-1.0, 1.0, (ACTIONS,)))
-    config = TACConfig().debugging(seed=0)
-    small = {"hidden_sizes": (16, 16), "batch_size": BATCH, "random_steps": 0, "lr": 2e-2}
-    config.training(**{**small, "tau": 0.05, "normalise_observations": False, **settings})
-    config.environment(observation_space=spaces[0], action_space=spaces[1])
-    with _determinism_without_compiler():
-        built: TACLearner = config.build_learner(spaces={DEFAULT_MODULE_ID: spaces})
-    return built
+    observations = gym.spaces.Box(-1.0, 1.0, (1,))
+    fast = {"batch_size": BATCH, "lr": 2e-2, "tau": 0.05, "normalise_observations": False}
+    return small_learner(observations, ACTIONS, 0, **{**fast, **settings})
 
 
 def learn(built: TACLearner, updates: int, env_steps: int = 0) -> dict[str, float]:

@@ -12,6 +12,7 @@ import pytest
 from numba.core.caching import FunctionCache
 
 from music_rllib.kernels.compiling import compiled, is_kept, kept_on_disk
+from tests.processes import fresh
 
 PROGRAM = """
 from music_rllib.kernels.compiling import is_kept, kept_on_disk
@@ -29,8 +30,7 @@ def test_machine_code_is_cached_until_the_source_changes(tmp_path: Path) -> None
     program = tmp_path / "program.py"
 
     def result_and_hits() -> str:
-        command = [sys.executable, str(program)]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+        return fresh(program).stdout
 
     program.write_text(PROGRAM)
     assert [result_and_hits() for _ in range(2)] == ["42 0 False True\n", "42 1 True True\n"]

@@ -19,18 +19,20 @@ from music_rllib.tac.learner import TACLearner
 OBSERVATION, ACTION, BATCH = 6, 3, 32
 
 
-def learner(**settings: Any) -> TACLearner:
-    spaces = (
-        gym.spaces.Box(-np.inf, np.inf, (OBSERVATION,)),
-        gym.spaces.Box(-1.0, 1.0, (ACTION,)),
-    )
-    config = TACConfig().debugging(seed=3)
-    config.training(
-        **{"hidden_sizes": (16, 16), "batch_size": BATCH, "random_steps": 0, **settings}
-    )
+def small_learner(observations: gym.Space, actions: int, seed: int, **settings: Any) -> TACLearner:
+    """A learner with small networks for `actions` dimensions of actions."""
+    spaces = (observations, gym.spaces.Box(-1.0, 1.0, (actions,)))
+    config = TACConfig().debugging(seed=seed)
+    config.training(**{"hidden_sizes": (16, 16), "random_steps": 0, **settings})
     config.environment(observation_space=spaces[0], action_space=spaces[1])
     with _determinism_without_compiler():
         built: TACLearner = config.build_learner(spaces={DEFAULT_MODULE_ID: spaces})
+    return built
+
+
+def learner(**settings: Any) -> TACLearner:
+    observations = gym.spaces.Box(-np.inf, np.inf, (OBSERVATION,))
+    built = small_learner(observations, ACTION, 3, **{"batch_size": BATCH, **settings})
     built.module[DEFAULT_MODULE_ID].double()
     return built
 

@@ -3,26 +3,20 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from benchmarks.measure import ratio_row
+from tests.processes import fresh
 
 ROOT = Path(__file__).parents[3]
-
-
-def bench(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "benchmarks", *map(str, arguments)]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+BENCH = ("-m", "benchmarks")
 
 
 def test_a_group_is_measured_printed_and_written(tmp_path: Path) -> None:
-    finished = bench("--repeats", "1", "--output", tmp_path / "bench", "replay")
-    assert finished.returncode == 0, finished.stderr
+    finished = fresh(*BENCH, "--repeats", 1, "--output", tmp_path / "bench", "replay", cwd=ROOT)
     document = json.loads((tmp_path / "bench" / "bench.json").read_text())
     values = {row["what"]: row for row in document["rows"]}
     hindsight = values["HER, 20,000 trajectories: a minibatch"]
@@ -43,8 +37,7 @@ def test_bad_input_is_refused_before_anything_is_measured(tmp_path: Path) -> Non
         (["--repeats", "0", "replay"], "--repeats must be >= 1, got 0"),
         (["--output", str(tmp_path / "file"), "replay"], "--output can't be a folder"),
     ):
-        finished = bench(*arguments)
-        assert finished.returncode == 2
+        finished = fresh(*BENCH, *arguments, code=2, cwd=ROOT)
         assert told in finished.stderr
         assert "measuring" not in finished.stderr
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from tests.integration.devtools import Page
+from tests.processes import fresh
 
 ROOT = Path(__file__).parents[3]
 """Folder for screenshots, such as docs/img."""
@@ -18,28 +17,14 @@ ROOT = Path(__file__).parents[3]
 
 @pytest.mark.parametrize("page", ["configuration", "results"])
 def test_generated_pages_are_up_to_date(page: str) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", f"docs.generate_{page}", "--check"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+    fresh("-m", f"docs.generate_{page}", "--check", cwd=ROOT)
 
 
 def test_the_site_is_built_read_and_searched(
     require_service: Callable[[str], Path], tmp_path: Path
 ) -> None:
     site = tmp_path / "site"
-    done = subprocess.run(
-        [sys.executable, str(ROOT / "docs" / "build_site.py"), str(site)],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=tmp_path,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+    fresh(ROOT / "docs" / "build_site.py", site, cwd=tmp_path)
 
     async def read() -> None:
         async with Page(require_service("chromium"), tmp_path, width=1400) as tab:

@@ -28,6 +28,7 @@ from music_rllib.report.build import PAGE
 from tests.integration.conftest import call, metric_steps, program_environment, rows
 from tests.integration.devtools import PATIENCE, Page
 from tests.integration.mlflow_server import MlflowServer, comparing
+from tests.processes import fresh
 
 pytestmark = pytest.mark.e2e
 
@@ -98,16 +99,8 @@ def _run(folder: Path, report: str) -> str:
     user = {names.VARIABLE_REPORT: report, "COLUMNS": "160", "HOME": str(folder / "home")}
     environment = program_environment() | user
     del environment["RAY_AUTH_MODE"]
-    done = subprocess.run(
-        [sys.executable, "-m", "music_rllib.sweep", "my_sweep.yaml"],
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=280,
-    )
-    assert (done.returncode, done.stderr) == (0, "")
+    done = fresh("-m", "music_rllib.sweep", "my_sweep.yaml", cwd=folder, env=environment)
+    assert done.stderr == ""
     return done.stdout
 
 

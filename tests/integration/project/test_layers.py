@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from tests.processes import fresh
+
 PACKAGE = Path(__file__).parents[3] / "music_rllib"
 
 # Only these may load Ray; everything else is usable, and tested, without it.
@@ -76,14 +78,7 @@ def test_lower_layers_load_no_ray() -> None:
         "    assert not loaded, f'music_rllib.{module} loads {loaded}'\n"
     )
     argument = json.dumps([(module, checked[module]) for module in order])
-    done = subprocess.run(
-        [sys.executable, "-c", code, argument],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    fresh("-c", code, argument)
 
 
 def test_a_driver_loads_only_the_modules_that_it_needs() -> None:
@@ -99,8 +94,7 @@ def test_a_driver_loads_only_the_modules_that_it_needs() -> None:
         "import music_rllib.sweep.execution, music_rllib.tune.runner\n"
         f"check(*{never!r})\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    fresh("-c", code)
 
 
 def test_a_run_begins_without_torchs_compiler() -> None:
@@ -118,8 +112,7 @@ def test_a_run_begins_without_torchs_compiler() -> None:
         "optimizer.zero_grad()\n"
         "assert 'torch._dynamo' not in sys.modules\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    fresh("-c", code)
 
 
 def test_the_rules_name_existing_modules() -> None:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import dataclasses
 import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import get_args
 
@@ -15,7 +13,6 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from music_rllib import names
-from music_rllib.config.load import load_config
 from music_rllib.experiment.open_sweep import open_sweep
 from music_rllib.experiment.plan import Node, make_plan
 from music_rllib.experiment.record import keep_record
@@ -27,6 +24,8 @@ from music_rllib.results.data import Sweep
 from music_rllib.results.read import read_sweep
 from music_rllib.store.history import HISTORY, Report, RunResult, last_values, to_json_lines
 from music_rllib.sweep.listeners.state_file import StateFile
+from tests.processes import fresh
+from tests.sweep_files import loaded
 
 STEPS = range(20_000, 100_001, 20_000)
 CONFIG = """
@@ -120,18 +119,14 @@ def values(node: Node, step: int) -> dict[str, float]:
 
 @pytest.fixture(scope="module")
 def nodes(tmp_path_factory: pytest.TempPathFactory) -> list[Node]:
-    file = tmp_path_factory.mktemp("config") / "tiny.yaml"
-    file.write_text(CONFIG)
-    return list(make_plan(load_config(file)).nodes)
+    return list(make_plan(loaded(tmp_path_factory.mktemp("config"), CONFIG)).nodes)
 
 
 @pytest.fixture(scope="module")
 def sweep_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A sweep of two stages; one of its six runs failed, and the last one has not started."""
     storage = tmp_path_factory.mktemp("results")
-    file = storage / "tiny.yaml"
-    file.write_text(CONFIG)
-    config = load_config(file, storage=str(storage))
+    config = loaded(storage, CONFIG, storage=str(storage))
     sweep = open_sweep(config, make_plan(config), str(storage))
     keep_record(sweep)
     with StateFile(sweep) as state_file:
@@ -175,14 +170,7 @@ def page(sweep_folder: Path) -> Path:
         "import sys; sys.modules['ray'] = sys.modules['mlflow'] = None\n"
         "from music_rllib.program import main; sys.exit(main(['report', *sys.argv[1:]]))"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(sweep_folder)],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
-    )
-    assert done.returncode == 0, done.stderr
+    done = fresh("-c", code, sweep_folder)
     assert not done.stderr
     path = sweep_folder / "report" / PAGE
     picture = path.parent / "figures" / "overview.png"

@@ -26,6 +26,7 @@ from music_rllib.tracking.tracker import Tracker
 from tests.faults import comparison
 from tests.integration.mlflow_server import USER, server_script
 from tests.ports import free_port
+from tests.processes import fresh
 
 pytestmark = pytest.mark.integration
 
@@ -75,15 +76,8 @@ PATIENCE = 1500
 
 
 def command(program: Any, *arguments: str) -> tuple[int, str, str]:
-    done = subprocess.run(
-        [sys.executable, "-m", "music_rllib.sweep", *arguments],
-        cwd=program.folder,
-        env=program.environment,
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-        check=False,
-    )
+    place = {"cwd": program.folder, "env": program.environment}
+    done = fresh("-m", "music_rllib.sweep", *arguments, code=None, timeout=PATIENCE, **place)
     return done.returncode, done.stdout, done.stderr
 
 

@@ -10,8 +10,6 @@ import json
 import math
 import os
 import random
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
@@ -40,6 +38,7 @@ from music_rllib.search import study as study_module
 from music_rllib.search.outcome import outcome
 from music_rllib.sweep.listeners.state_file import StateFile
 from tests.played_search import SPACE, Document, Driver, document, points, searched, success
+from tests.processes import fresh
 
 
 @pytest.fixture
@@ -796,14 +795,8 @@ def test_node_keys_are_the_same_in_another_process(tmp_path: Path) -> None:
         "print(json.dumps([[run.label, run.key] for run in driver.sweep.plan.runs]))"
     )
     (tmp_path / "there").mkdir()
-    found = subprocess.run(
-        [sys.executable, "-c", code, str(tmp_path / "there")],
-        env=os.environ | {"PYTHONHASHSEED": "12345", "LC_ALL": "C", "TZ": "Asia/Tokyo"},
-        cwd=Path(__file__).parents[3],
-        capture_output=True,
-        check=True,
-        text=True,
-    )
+    elsewhere = os.environ | {"PYTHONHASHSEED": "12345", "LC_ALL": "C", "TZ": "Asia/Tokyo"}
+    found = fresh("-c", code, tmp_path / "there", env=elsewhere, cwd=Path(__file__).parents[3])
     here = {run.label: run.key for run in driver.sweep.plan.runs}
     assert dict(json.loads(found.stdout.splitlines()[-1])) == here
 

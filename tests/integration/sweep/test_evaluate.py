@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +18,7 @@ from music_rllib.policy.rollout import open_task, play
 from music_rllib.policy.video import FORMATS, VideoError, film, find_renderer, write_video
 from music_rllib.program import main
 from tests.integration.conftest import ENVIRONMENTS
+from tests.processes import fresh
 
 REACH = BUILT_IN_TASKS["FetchReach"]
 
@@ -206,14 +205,9 @@ def test_a_fresh_process_reports_that_mujoco_does_not_load_with_a_renderer(good:
     inherited = {key: text for key, text in os.environ.items() if key != "PYOPENGL_PLATFORM"}
     if find_renderer("osmesa")[0] is not None:
         pytest.skip("osmesa works here")
-    done = subprocess.run(
-        [sys.executable, "-m", "music_rllib", "evaluate", str(good), "--episodes", "1"],
-        env=inherited | {"MUJOCO_GL": "osmesa"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 2
+    environment = inherited | {"MUJOCO_GL": "osmesa"}
+    play = ("-m", "music_rllib", "evaluate", good, "--episodes", 1)
+    done = fresh(*play, code=2, env=environment)
     assert "MuJoCo can't be loaded with MUJOCO_GL=osmesa" in done.stderr
     assert "unset it, or install" in done.stderr
     assert "Traceback" not in done.stderr

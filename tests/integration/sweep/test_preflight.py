@@ -4,12 +4,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
-from music_rllib.config.load import load_config
 from music_rllib.experiment.plan import make_plan
 from music_rllib.sweep.preflight import TaskError, check_environments
 from tests.integration.conftest import ENVIRONMENTS
+from tests.sweep_files import loaded
 
 PUSH: dict[str, Any] = {
     "env_id": "FetchPush-v4",
@@ -32,9 +31,7 @@ def check(folder: Path, *tasks: dict[str, Any], **replay: Any) -> list[str]:
             {"name": "without", "variant": "tac"},
         ],
     }
-    path = folder / "sweep.yaml"
-    path.write_text(yaml.safe_dump(document))
-    return check_environments(make_plan(load_config(path)))
+    return check_environments(make_plan(loaded(folder, document)))
 
 
 MISFITS: list[tuple[dict[str, Any], str]] = [

@@ -14,7 +14,6 @@ from mlflow import MlflowClient
 from typer.testing import CliRunner
 
 from music_rllib import names
-from music_rllib.config.load import load_config
 from music_rllib.experiment.open_sweep import open_sweep
 from music_rllib.experiment.plan import make_plan
 from music_rllib.experiment.record import keep_record
@@ -30,6 +29,7 @@ from tests.integration.conftest import REPOSITORY
 from tests.integration.devtools import Page
 from tests.integration.mlflow_server import MlflowServer, comparing
 from tests.played_search import publish
+from tests.sweep_files import loaded
 
 NAME = "proof-fetch-push-her"
 
@@ -37,9 +37,7 @@ NAME = "proof-fetch-push-her"
 def log_published_sweep(folder: Path) -> str:
     """Log a published sweep and its report into a storage's MLflow; the path of its comparison."""
     sweep = read_archive(REPOSITORY / "docs" / "results" / "data" / NAME)
-    file = folder / "sweep.yaml"
-    file.write_text(str(sweep.config))
-    config = load_config(file)
+    config = loaded(folder, str(sweep.config))
     plan = make_plan(config)
     of_seed = {(run.entropic_index, run.seed): number for number, run in enumerate(sweep.runs)}
     opened = open_sweep(config, plan, str(folder))

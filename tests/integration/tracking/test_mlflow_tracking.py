@@ -30,7 +30,9 @@ from music_rllib.store.history import Report
 from music_rllib.tracking.policy_model import write_model
 from music_rllib.tracking.run_queue import StoredRun
 from music_rllib.tracking.tracker import SweepRun, Tracker
+from tests.integration.conftest import runs_by_name
 from tests.integration.mlflow_server import MlflowServer
+from tests.processes import fresh
 
 MakeTracker = Callable[..., Tracker]
 STEPS = list(range(2000, 22_000, 2000))
@@ -89,8 +91,7 @@ def fresh_store(tmp_path_factory: pytest.TempPathFactory) -> FreshStore:
         "import sys; from music_rllib.tracking.tracker import Tracker; "
         "Tracker(sweep_name='first', storage=sys.argv[1], config={}).close()"
     )
-    command = [sys.executable, "-c", code, str(folder)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    done = fresh("-c", code, folder)
     return FreshStore(folder / "mlflow.db", done.stdout + done.stderr)
 
 
@@ -125,14 +126,8 @@ def client_of(storage: Path) -> MlflowClient:
     return MlflowClient(f"sqlite:///{storage}/mlflow.db")
 
 
-def runs_of(client: MlflowClient, experiment: str = "smoke") -> dict[str, Run]:
-    """The experiment's runs by name, which must be unique."""
-    found = client.get_experiment_by_name(experiment)
-    assert found is not None
-    runs = list(client.search_runs([found.experiment_id]))
-    by_name = {run.info.run_name: run for run in runs}
-    assert len(by_name) == len(runs), [run.info.run_name for run in runs]
-    return by_name
+def runs_of(client: MlflowClient) -> dict[str, Run]:
+    return runs_by_name(client, "smoke")
 
 
 def logged_steps(client: MlflowClient, run: Run, metric: str = names.EVAL_SUCCESS) -> list[int]:
@@ -458,12 +453,7 @@ def test_a_final_policy_is_a_model_that_loads_and_acts(
     assert [output.model_id for output in run.outputs.model_outputs] == [model.model_id]
     files = [path for path in (storage / "mlartifacts").rglob("*") if path.is_file()]
     assert not [path for path in files if path.suffix in {".pkl", ".pt", ".pickle"}]
-    done = subprocess.run(
-        [sys.executable, "-c", ELSEWHERE, f"sqlite:///{storage}/mlflow.db", model.model_uri],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    done = fresh("-c", ELSEWHERE, f"sqlite:///{storage}/mlflow.db", model.model_uri)
     single, batch = json.loads(done.stdout)
     np.testing.assert_allclose(single, np.tanh([0.5, 5.0]), atol=1e-6)
     np.testing.assert_allclose(batch, [np.tanh([0.0, -0.5])], atol=1e-6)

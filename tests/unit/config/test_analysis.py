@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
-from music_rllib.config.load import load_config
 from music_rllib.config.problems import ConfigError
 from music_rllib.config.schema import Hypothesis
+from tests.sweep_files import loaded
 
 Document = dict[str, Any]
 Problems = Callable[[str, Document], list[str]]
@@ -31,15 +30,13 @@ def problems(tmp_path: Path) -> Problems:
     """The problems of a sweep with one hypothesis and one stage, `s`, that starts from another."""
 
     def problems_of(hypothesis: str, stage: Document) -> list[str]:
-        path = tmp_path / "sweep.yaml"
         stages = [
             {"name": "u", "variant": "music-u"},
             {"name": "s", "variant": "music-r", "init_from": "u", **stage},
         ]
         document = {"name": "n", "tasks": ["FetchPush"], "stages": stages}
-        path.write_text(yaml.safe_dump(document | {"analysis": {"hypotheses": [hypothesis]}}))
         try:
-            load_config(path)
+            loaded(tmp_path, document | {"analysis": {"hypotheses": [hypothesis]}})
         except ConfigError as error:
             return list(error.lines)
         return []

@@ -10,6 +10,7 @@ from music_rllib.config.load import load_config
 from music_rllib.config.problems import ConfigError
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.schema import SweepConfig
+from tests.sweep_files import loaded
 
 SWEEP = """
 name: mine
@@ -29,9 +30,15 @@ stages:
 
 
 def load(folder: Path, *arguments: str, text: str = SWEEP) -> SweepConfig:
-    path = folder / "sweep.yaml"
-    path.write_text(text)
-    return load_config(path, overrides=arguments)
+    return loaded(folder, text, overrides=arguments)
+
+
+def mistake(folder: Path, *arguments: str, text: str = SWEEP) -> str:
+    """The only mistake of a configuration."""
+    with pytest.raises(ConfigError) as refusal:
+        load(folder, *arguments, text=text)
+    (line,) = refusal.value.lines
+    return line
 
 
 def runs(config: SweepConfig) -> list[RunSettings]:
@@ -140,10 +147,8 @@ def test_fields_that_a_grid_group_does_not_vary_can_be_overridden(tmp_path: Path
     searched = searched.replace("]}\n", "]}}}\n")
     assert runs(load(tmp_path, "tac.gamma=0.9", text=searched))[0].tac.gamma == 0.9
     for text, place in ((GROUPED, "grid"), (searched, "search.space")):
-        with pytest.raises(ConfigError) as refusal:
-            load(tmp_path, "tac.alpha=0.3", text=text)
         rule = f"tac.alpha must not be given where stages.train.{place}.tac varies it"
-        assert refusal.value.lines == (f"command line: {rule}",)
+        assert mistake(tmp_path, "tac.alpha=0.3", text=text) == f"command line: {rule}"
 
 
 TUNED = "tac: [{entropic_index: 1, alpha: 0.1}, {entropic_index: 2, alpha: 0.2}]"
@@ -184,10 +189,8 @@ TWICE: list[tuple[str, str]] = [
 @pytest.mark.parametrize(("varied", "message"), TWICE)
 def test_a_field_of_a_group_varies_once(tmp_path: Path, varied: str, message: str) -> None:
     stage = f"{{name: a, variant: tac, {varied}}}"
-    with pytest.raises(ConfigError) as refusal:
-        load(tmp_path, text=f"name: mine\ntasks: [FetchReach]\nstages: [{stage}]\n")
-    (line,) = refusal.value.lines
-    assert message in line
+    text = f"name: mine\ntasks: [FetchReach]\nstages: [{stage}]\n"
+    assert message in mistake(tmp_path, text=text)
 
 
 def test_a_field_may_vary_if_the_group_lacks_it(tmp_path: Path) -> None:
@@ -222,10 +225,7 @@ REFUSED: list[tuple[str, str]] = [
 def test_each_mistake_of_the_command_line_is_reported_once(
     tmp_path: Path, argument: str, message: str
 ) -> None:
-    with pytest.raises(ConfigError) as refusal:
-        load(tmp_path, argument)
-    (line,) = refusal.value.lines
-    assert message in line
+    assert message in mistake(tmp_path, argument)
 
 
 def test_mistakes_of_two_arguments(tmp_path: Path) -> None:
@@ -233,10 +233,7 @@ def test_mistakes_of_two_arguments(tmp_path: Path) -> None:
         (("stages.first.per_task=5", "tac.lr=0.1"), "per_task must be a mapping of keys to values"),
         (("tac.lr=0.1", "tac={lr: 0.2}"), "command line: tac.lr must not repeat"),
     ):
-        with pytest.raises(ConfigError) as refusal:
-            load(tmp_path, *arguments)
-        (line,) = refusal.value.lines
-        assert message in line
+        assert message in mistake(tmp_path, *arguments)
 
 
 FILES: list[tuple[str, Any]] = [
@@ -251,21 +248,15 @@ FILES: list[tuple[str, Any]] = [
 
 @pytest.mark.parametrize(("text", "message"), FILES, ids=[text for text, _ in FILES])
 def test_each_mistake_of_a_file_is_reported_once(tmp_path: Path, text: str, message: str) -> None:
-    path = tmp_path / "sweep.yaml"
     stage = "{name: a, variant: tac, grid: {tac.entropic_index: [1, 2, 3], tac.tau: [.1, .2]}}"
-    path.write_text(f"name: mine\ntasks: [FetchReach]\n{text}\nstages: [{stage}]\n")
-    with pytest.raises(ConfigError) as refusal:
-        load_config(path)
-    (line,) = refusal.value.lines
-    assert message in line
+    content = f"name: mine\ntasks: [FetchReach]\n{text}\nstages: [{stage}]\n"
+    assert message in mistake(tmp_path, text=content)
 
 
 def test_an_unknown_key_of_a_grid_is_one_mistake(tmp_path: Path) -> None:
-    path = tmp_path / "sweep.yaml"
     stage = "{name: a, variant: tac, grid: {q: [1, 2, 3], tac.gamma: [0.9, 1.5, 2]}}"
-    path.write_text(f"name: mine\ntasks: [FetchReach]\nstages: [{stage}]\n")
     with pytest.raises(ConfigError) as refusal:
-        load_config(path)
+        load(tmp_path, text=f"name: mine\ntasks: [FetchReach]\nstages: [{stage}]\n")
     assert list(refusal.value.lines) == [
         "sweep.yaml:3: stages.a.grid.q is not a known setting (did you mean 'tac.entropic_index'?)",
         "sweep.yaml:3: stages.a.grid.tac.gamma[1] must be < 1, got 1.5",

@@ -6,9 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
-from music_rllib.config.load import load_config
 from music_rllib.envs.fingerprint import Fingerprint
 from music_rllib.errors import BadInputError
 from music_rllib.experiment.open_sweep import (
@@ -26,6 +24,7 @@ from music_rllib.experiment.scheduler import Status
 from music_rllib.results.analysis import mixed
 from music_rllib.store.history import RunResult
 from music_rllib.store.lease import Lease
+from tests.sweep_files import loaded
 
 OLD = {"package mujoco": "3.8.0", "source lab_env.py": "a"}
 NEW = {"package mujoco": "3.8.1", "source lab_env.py": "b"}
@@ -55,9 +54,7 @@ def opened(folder: Path, environment: Fingerprint, name: str = "s", **defaults: 
             },
         ],
     }
-    path = folder / "sweep.yaml"
-    path.write_text(yaml.safe_dump(document))
-    config, storage = load_config(path), str(folder / "results")
+    config, storage = loaded(folder, document), str(folder / "results")
     environments = {"Lab": environment, "Field": {"source field.py": "f"}}
     return open_sweep(config, make_plan(config), storage, environments=environments)
 

@@ -4,15 +4,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
 from music_rllib.config.load import load_config
 from music_rllib.config.problems import ConfigError
-from music_rllib.config.run_settings import RunSettings, variant_music
+from music_rllib.config.run_settings import variant_music
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.experiment import plan as plan_module
 from music_rllib.experiment.plan import Plan, make_plan, node_key, remarks
 from music_rllib.names import label_matches
+from tests.handoffs import music_u
+from tests.sweep_files import loaded
 
 Document = dict[str, Any]
 
@@ -26,10 +27,8 @@ FINETUNE: Document = {
 
 
 def plan(tmp_path: Path, **document: Any) -> Plan:
-    path = tmp_path / "sweep.yaml"
     base = {"name": "s", "tasks": ["FetchPush"], "defaults": {"env_steps": 6000}}
-    path.write_text(yaml.safe_dump(base | document, sort_keys=False))
-    return make_plan(load_config(path))
+    return make_plan(loaded(tmp_path, base | document))
 
 
 def test_pretrain_then_finetune(tmp_path: Path) -> None:
@@ -146,12 +145,6 @@ def test_keys_ignore_names_places_and_resources(tmp_path: Path) -> None:
     assert [node.key for node in renamed.nodes] == [node.key for node in plain.nodes]
 
 
-def settings(**changes: Any) -> RunSettings:
-    task = BUILT_IN_TASKS["FetchPush"]
-    base = {"task": task, "variant": "music-u", "seed": 0, "music": variant_music("music-u", task)}
-    return RunSettings.model_validate(base | changes)
-
-
 @pytest.mark.parametrize(
     "changes",
     [
@@ -170,37 +163,37 @@ def settings(**changes: Any) -> RunSettings:
     ids=lambda changes: next(iter(changes)),
 )
 def test_every_setting_is_part_of_the_key(changes: dict[str, Any]) -> None:
-    assert node_key(settings(**changes), None) != node_key(settings(), None)
+    assert node_key(music_u(**changes), None) != node_key(music_u(), None)
 
 
 def test_moved_distance_is_part_of_the_key_only_if_used() -> None:
     task = BUILT_IN_TASKS["FetchPush"].model_copy(update={"moved_distance": 0.02})
-    assert node_key(settings(task=task), None) == node_key(settings(), None)
+    assert node_key(music_u(task=task), None) == node_key(music_u(), None)
     moved = {"replay": {"hindsight_episodes": "moved"}}
-    assert node_key(settings(task=task, **moved), None) != node_key(settings(**moved), None)
+    assert node_key(music_u(task=task, **moved), None) != node_key(music_u(**moved), None)
 
 
 def test_symmetries_are_part_of_the_key_only_if_used() -> None:
     push = BUILT_IN_TASKS["FetchPush"]
     mirror = push.symmetries.model_copy(update={"translate": ()})
     other = push.model_copy(update={"symmetries": mirror})
-    assert node_key(settings(task=other), None) == node_key(settings(), None)
+    assert node_key(music_u(task=other), None) == node_key(music_u(), None)
     used = {"replay": {"symmetries": ["mirror"]}}
-    keys = [node_key(settings(task=task, **used), None) for task in (push, other)]
-    assert keys[0] == keys[1] != node_key(settings(), None)
+    keys = [node_key(music_u(task=task, **used), None) for task in (push, other)]
+    assert keys[0] == keys[1] != node_key(music_u(), None)
     both = {"replay": {"symmetries": ["translate", "mirror"]}}
-    assert node_key(settings(**both), None) == node_key(
-        settings(replay={"symmetries": ["mirror", "translate"]}), None
+    assert node_key(music_u(**both), None) == node_key(
+        music_u(replay={"symmetries": ["mirror", "translate"]}), None
     )
     block = BUILT_IN_TASKS["HandManipulateBlock"]
     with pytest.raises(ValueError, match="got mirror: HandManipulateBlock has none"):
-        settings(task=block, **used)
+        music_u(task=block, **used)
 
 
 def test_settings_of_no_intrinsic_reward_are_not_part_of_the_key() -> None:
-    assert node_key(settings(intrinsic={"weight": 0.7}), None) == node_key(settings(), None)
+    assert node_key(music_u(intrinsic={"weight": 0.7}), None) == node_key(music_u(), None)
     keys = {
-        node_key(settings(intrinsic={"reward": "rnd", **changes}), None)
+        node_key(music_u(intrinsic={"reward": "rnd", **changes}), None)
         for changes in ({}, {"weight": 0.7}, {"lr": 0.01}, {"settings": {"hidden": 8}})
     }
     assert len(keys) == 4
@@ -209,15 +202,15 @@ def test_settings_of_no_intrinsic_reward_are_not_part_of_the_key() -> None:
 def test_source_and_algorithm_version_are_part_of_the_key(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    keys = {node_key(settings(), None), node_key(settings(), "a"), node_key(settings(), "b")}
+    keys = {node_key(music_u(), None), node_key(music_u(), "a"), node_key(music_u(), "b")}
     monkeypatch.setattr(plan_module, "ALGORITHM_VERSION", "other")
-    keys.add(node_key(settings(), None))
+    keys.add(node_key(music_u(), None))
     assert len(keys) == 4
 
 
 def test_an_explicit_default_does_not_change_the_key() -> None:
-    spelt = settings(tac={"lr": 1e-3, "entropic_index": 1}, env_steps=200_000)
-    assert node_key(spelt, None) == node_key(settings(), None)
+    spelt = music_u(tac={"lr": 1e-3, "entropic_index": 1}, env_steps=200_000)
+    assert node_key(spelt, None) == node_key(music_u(), None)
 
 
 def test_keys_are_the_same_on_another_machine(tmp_path: Path) -> None:

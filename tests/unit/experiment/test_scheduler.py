@@ -5,14 +5,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 from ray.tune.error import TuneError
 from ray.tune.search import Searcher
 
-from music_rllib.config.load import load_config
 from music_rllib.experiment.plan import Plan, make_plan
 from music_rllib.experiment.scheduler import Scheduler, Status
 from music_rllib.tune.runner import DagSearcher, _file_error
+from tests.sweep_files import loaded
 
 STAGES: list[dict[str, Any]] = [
     {"name": "a", "variant": "music-u"},
@@ -27,10 +26,8 @@ STAGES: list[dict[str, Any]] = [
 
 
 def plan_of(folder: Path, stages: list[dict[str, Any]]) -> Plan:
-    path = folder / "s.yaml"
     document = {"name": "s", "tasks": ["FetchPush"], "seeds": [0, 1], "stages": stages}
-    path.write_text(yaml.safe_dump(document))
-    return make_plan(load_config(path))
+    return make_plan(loaded(folder, document))
 
 
 @pytest.fixture

@@ -7,12 +7,12 @@ import numpy as np
 
 from docs.result_pages.exports import of_plan
 from music_rllib import names
-from music_rllib.config.load import load_config
 from music_rllib.experiment.plan import make_plan
 from music_rllib.results.analysis_plan import AnalysisPlan, with_plan
 from music_rllib.results.archive import merged
 from music_rllib.results.data import Points, RunRecord, Sweep, columns
 from music_rllib.version import ALGORITHM_VERSION
+from tests.sweep_files import loaded
 
 
 def sweep(*runs: tuple[str, str, list[float]], run_id: str = "s") -> Sweep:
@@ -93,12 +93,11 @@ def test_a_later_plan_for_fewer_seeds_is_not_another_version() -> None:
 
 
 def test_runs_of_a_plan_are_found_in_exports_of_other_sweeps(tmp_path: Path) -> None:
-    file = tmp_path / "sweep.yaml"
-    file.write_text(
+    text = (
         "{name: mine, tasks: [FetchPush], seeds: [0, 1, 2], "
         "stages: [{name: first, variant: tac, grid: {tac.entropic_index: [1.0, 2.0]}}]}"
     )
-    plan = make_plan(load_config(file))
+    plan = make_plan(loaded(tmp_path, text))
     keys = [node.key for node in plan.nodes]
     exports = [
         sweep(("other", "FINISHED", [9]), (keys[4], "FINISHED", [1, 2]), (keys[0], "KILLED", [3])),
@@ -118,12 +117,12 @@ def test_runs_of_an_earlier_algorithm_replace_missing_ones(
     tmp_path: Path,
 ) -> None:
     """A run and the runs that start from it have the same version of the algorithm."""
-    file = tmp_path / "sweep.yaml"
-    file.write_text(
+    config = loaded(
+        tmp_path,
         "{name: mine, tasks: [FetchPush], seeds: [0, 1], stages: [{name: u, variant: music-u},"
-        " {name: r, variant: music-r, init_from: u}]}"
+        " {name: r, variant: music-r, init_from: u}]}",
     )
-    plan, earlier = make_plan(load_config(file)), make_plan(load_config(file), algorithm="2")
+    plan, earlier = make_plan(config), make_plan(config, algorithm="2")
     now, before = ([node.key for node in one.nodes] for one in (plan, earlier))
     assert not set(now) & set(before)
     exports = [

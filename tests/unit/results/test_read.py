@@ -9,10 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 
 from music_rllib import load_sweep, names
-from music_rllib.config.load import load_config
 from music_rllib.experiment.open_sweep import OpenSweep, open_sweep
 from music_rllib.experiment.plan import Node, make_plan
 from music_rllib.experiment.record import keep_record
@@ -26,6 +24,7 @@ from music_rllib.results.study import study_of
 from music_rllib.store.history import HISTORY, Report, RunResult, last_values, to_json_lines
 from music_rllib.store.storage import DamagedError
 from music_rllib.sweep.listeners.state_file import StateFile
+from tests.sweep_files import loaded
 
 PAUSE = 3_600_000
 """Milliseconds between two sittings."""
@@ -61,9 +60,7 @@ def opened_sweep(
         "defaults": {"env_steps": steps, "evaluation": {"interval": 500, "episodes": 20}},
         "stages": [{"name": "train", "variant": "tac", **stage}],
     }
-    file = folder / "s.yaml"
-    file.write_text(yaml.safe_dump(content))
-    config = load_config(file, storage=str(folder / "results"))
+    config = loaded(folder, content, storage=str(folder / "results"))
     opened = open_sweep(config, make_plan(config), config.storage)
     keep_record(opened)
     return opened

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -84,6 +85,17 @@ def run(
         },
     )
     return record, points
+
+
+def cells(
+    rng: np.random.Generator, seeds: int, *cells: tuple[Any, ...], **tags: str
+) -> list[tuple[RunRecord, Points]]:
+    """A run for each seed of each cell: q, possibly alpha, and the height."""
+    runs = []
+    for q, *alpha, height in cells:
+        settings = {"tac.entropic_index": q} | ({"tac.alpha": alpha[0]} if alpha else {})
+        runs += [run(settings, seed, height, rng, **tags) for seed in range(seeds)]
+    return runs
 
 
 def sweep_of(runs: Sequence[tuple[RunRecord, Points]], plans: Sequence[PlanVersion] = ()) -> Sweep:
@@ -177,12 +189,7 @@ def test_without_planned_results_there_is_no_answer(
 def test_without_a_plan_the_control_is_read_from_the_runs(
     alphas: Mapping[str, Sequence[str]], expected: str, rng: np.random.Generator
 ) -> None:
-    runs = [
-        run({"tac.entropic_index": q, "tac.alpha": alpha}, seed, 0.3, rng)
-        for q, values in alphas.items()
-        for alpha in values
-        for seed in range(5)
-    ]
+    runs = cells(rng, 5, *((q, one, 0.3) for q, values in alphas.items() for one in values))
     sweep = sweep_of(runs)
     assert f"Control: {expected}" in " ".join(answer(sweep, study_of(sweep)))
 
@@ -205,11 +212,7 @@ def test_a_hypothesis_about_finished_runs_is_not_planned_but_the_others_are(
 ) -> None:
     """A plan may compare new runs with those of an earlier study."""
     known = study({"1": 0.2}, 8, rng)
-    new = [
-        run({"tac.entropic_index": q}, seed, height, rng, stage="finetune")
-        for q, height in (("1", 0.3), ("1.5", 0.4))
-        for seed in range(8)
-    ]
+    new = cells(rng, 8, ("1", 0.3), ("1.5", 0.4), stage="finetune")
     times = [DONE + 5] * len(new[0][1].times)
     later = [(record, points._replace(times=times)) for record, points in new]
     between_q, between_stages = (
@@ -254,11 +257,7 @@ def test_a_hypothesis_is_planned_by_the_last_version_before_its_result(
 ) -> None:
     """A stage and a hypothesis about it are added when an earlier stage has finished."""
     train = study({"1": 0.2, "1.5": 0.4}, 8, rng)
-    tune = [
-        run({"tac.entropic_index": q}, seed, height, rng, stage="tune")
-        for q, height in (("1", 0.2), ("1.5", 0.4))
-        for seed in range(8)
-    ]
+    tune = cells(rng, 8, ("1", 0.2), ("1.5", 0.4), stage="tune")
     later = [
         (record, points._replace(times=[DONE + 5] * len(points.times))) for record, points in tune
     ]
@@ -328,11 +327,7 @@ def test_a_late_hypothesis_does_not_make_others_of_its_version_late(
     new = "stage = tune, q = 1.5 against stage = tune, q = 1"
     versions = with_plan((), plan(old), DONE - 1)
     versions = with_plan(versions, plan(late, new), DONE + 1)
-    tune = [
-        run({"tac.entropic_index": q}, seed, height, rng, stage="tune")
-        for q, height in (("1", 0.2), ("1.5", 0.4))
-        for seed in range(8)
-    ]
+    tune = cells(rng, 8, ("1", 0.2), ("1.5", 0.4), stage="tune")
     tune = [(one, points._replace(times=[DONE + 5] * len(points.times))) for one, points in tune]
     found = study_of(sweep_of([*train, *tune], versions))
     assert [one.hypothesis.text for one in found.planned if one.hypothesis] == [old, new]
@@ -340,12 +335,8 @@ def test_a_late_hypothesis_does_not_make_others_of_its_version_late(
 
 
 def test_settings_that_a_hypothesis_does_not_name_are_averaged(rng: np.random.Generator) -> None:
-    runs = [
-        run({"tac.entropic_index": q, "tac.alpha": alpha}, seed, height, rng)
-        for q, gain in (("1", 0.0), ("1.5", 0.1))
-        for alpha, height in (("0.01", 0.1 + gain), ("0.1", 0.3 + gain))
-        for seed in range(5)
-    ]
+    q_1 = ("1", "0.01", 0.1), ("1", "0.1", 0.3)
+    runs = cells(rng, 5, *q_1, ("1.5", "0.01", 0.2), ("1.5", "0.1", 0.4))
     (claim,) = study_of(sweep_of(runs, BEFORE)).planned
     assert (len(claim.pairs), claim.contrast.seeds) == (2, (5, 5))
     assert float(claim.contrast.difference.value) == pytest.approx(0.1, abs=0.03)
@@ -358,12 +349,8 @@ def test_settings_that_a_hypothesis_does_not_name_are_averaged(rng: np.random.Ge
 
 
 def test_sensitivity_to_alpha_has_a_line_for_each_q(rng: np.random.Generator) -> None:
-    runs = [
-        run({"tac.entropic_index": q, "tac.alpha": alpha}, seed, height, rng)
-        for q in ("1", "1.5")
-        for alpha, height in (("0.1", 0.3), ("0.01", 0.1), ("0.02", 0.2))
-        for seed in range(4)
-    ]
+    alphas = (("0.1", 0.3), ("0.01", 0.1), ("0.02", 0.2))
+    runs = cells(rng, 4, *((q, *alpha) for q in ("1", "1.5") for alpha in alphas))
     found = study_of(sweep_of(runs))
     lines = alpha_lines(found.means)
     assert [[alpha for alpha, _ in line] for line in lines] == [[0.01, 0.02, 0.1]] * 2
@@ -382,12 +369,8 @@ def test_sensitivity_to_alpha_has_a_line_for_each_q(rng: np.random.Generator) ->
 
 
 def test_many_conditions_are_compared_with_q_1_at_equal_settings(rng: np.random.Generator) -> None:
-    runs = [
-        run({"tac.entropic_index": q, "tac.alpha": alpha}, seed, 0.2, rng)
-        for q in ("1", "1.5", "2", "3")
-        for alpha in ("0.01", "0.1")
-        for seed in range(2)
-    ]
+    grid = itertools.product(("1", "1.5", "2", "3"), ("0.01", "0.1"), (0.2,))
+    runs = cells(rng, 2, *grid)
     pairs = [(one.first, one.second) for one in study_of(sweep_of(runs)).unplanned]
     assert ("q = 2, α = 0.1", "q = 1, α = 0.1") in pairs
     assert len(pairs) == 6
@@ -396,12 +379,7 @@ def test_many_conditions_are_compared_with_q_1_at_equal_settings(rng: np.random.
 def test_many_conditions_without_equal_settings_are_compared_with_the_first(
     rng: np.random.Generator,
 ) -> None:
-    settings = [("1", "0.05"), *((str(q), f"0.{q}") for q in range(2, 8))]
-    runs = [
-        run({"tac.entropic_index": q, "tac.alpha": alpha}, seed, 0.2, rng)
-        for q, alpha in settings
-        for seed in range(2)
-    ]
+    runs = cells(rng, 2, ("1", "0.05", 0.2), *((f"{q}", f"0.{q}", 0.2) for q in range(2, 8)))
     found = study_of(sweep_of(runs)).unplanned
     assert len(found) == 6
     (reference,) = {claim.second for claim in found}
@@ -409,11 +387,7 @@ def test_many_conditions_without_equal_settings_are_compared_with_the_first(
 
 
 def own_alphas(rng: np.random.Generator) -> list[tuple[RunRecord, Points]]:
-    return [
-        run({"tac.entropic_index": q, "tac.alpha": alpha}, seed, height, rng)
-        for q, alpha, height in (("1", "0.15", 0.3), ("1.5", "0.05", 0.33), ("2", "0.05", 0.3))
-        for seed in range(6)
-    ]
+    return cells(rng, 6, ("1", "0.15", 0.3), ("1.5", "0.05", 0.33), ("2", "0.05", 0.3))
 
 
 def test_tables_fit_a_console_of_80_columns(rng: np.random.Generator) -> None:
@@ -470,7 +444,7 @@ def test_verdicts_do_not_change_when_another_task_or_comparison_finishes(
     """What is planned and has no result, or an interim one, counts with p = 1."""
     tasks = ("FetchPush", "FetchSlide")
     runs = {
-        (task, q): [run({"tac.entropic_index": q}, seed, h, rng, task=task) for seed in range(8)]
+        (task, q): cells(rng, 8, (q, h), task=task)
         for task in tasks
         for q, h in (("1", 0.3), ("1.5", 0.33), ("2", 0.5))
     }
@@ -533,13 +507,9 @@ def test_the_family_is_that_of_the_compared_metric(rng: np.random.Generator) -> 
 
 def test_a_hypothesis_is_about_the_tasks_of_both_stages(rng: np.random.Generator) -> None:
     runs = [
-        run({"tac.entropic_index": "1"}, seed, height, rng, task=task, stage=stage)
-        for stage, task, height in (
-            ("her", "FetchPush", 0.2),
-            ("her", "FetchSlide", 0.2),
-            ("music", "FetchPush", 0.4),
-        )
-        for seed in range(6)
+        *cells(rng, 6, ("1", 0.2), stage="her", task="FetchPush"),
+        *cells(rng, 6, ("1", 0.2), stage="her", task="FetchSlide"),
+        *cells(rng, 6, ("1", 0.4), stage="music", task="FetchPush"),
     ]
     budget = {"FetchPush": BUDGET, "FetchSlide": BUDGET}
     text = "stage = music against stage = her"
@@ -548,12 +518,8 @@ def test_a_hypothesis_is_about_the_tasks_of_both_stages(rng: np.random.Generator
     assert (found.family, found.untested) == (1, ())
     # Over two common tasks, there is a comparison over both.
     more = [
-        run({"tac.entropic_index": "1"}, seed, height, rng, task=task, stage=stage)
-        for stage, task, height in (
-            ("music", "FetchSlide", 0.4),
-            ("her", "FetchPickAndPlace", 0.2),
-        )
-        for seed in range(6)
+        *cells(rng, 6, ("1", 0.4), stage="music", task="FetchSlide"),
+        *cells(rng, 6, ("1", 0.2), stage="her", task="FetchPickAndPlace"),
     ]
     budget["FetchPickAndPlace"] = BUDGET
     versions = with_plan((), plan(text, stage="her", budget=budget), 5)
@@ -565,11 +531,7 @@ def test_the_answer_counts_runs_of_all_planned_stages(rng: np.random.Generator) 
     """The displayed stage need not be the compared one."""
     train = study({"1": 0.3, "1.5": 0.3}, 8, rng)
     train[0] = (replace(train[0][0], status="FAILED"), train[0][1])
-    tune = [
-        run({"tac.entropic_index": q}, seed, 0.0, rng, stage="tune")
-        for q in ("1", "1.5")
-        for seed in range(8)
-    ]
+    tune = cells(rng, 8, ("1", 0.0), ("1.5", 0.0), stage="tune")
     text = "stage = train, q = 1.5 against stage = train, q = 1"
     sweep = sweep_of([*train, *tune], with_plan((), plan(text, stage="tune"), 5))
     said = " ".join(answer(sweep, study_of(sweep)))
@@ -595,11 +557,10 @@ def test_small_differences_have_the_decimals_of_their_interval() -> None:
 def test_stages_with_and_without_a_search_are_compared_side_by_side(
     rng: np.random.Generator,
 ) -> None:
-    her = [run({"tac.entropic_index": "1"}, seed, 0.2, rng, stage="her") for seed in range(6)]
+    her = cells(rng, 6, ("1", 0.2), stage="her")
     searched = [
-        run({"tac.entropic_index": "1", "tac.alpha": alpha}, seed, 0.4, rng, stage="tune", part=p)
-        for alpha, p, seeds in (("0.1", "trial0", range(2)), ("0.2", "final0", range(6)))
-        for seed in seeds
+        *cells(rng, 2, ("1", "0.1", 0.4), stage="tune", part="trial0"),
+        *cells(rng, 6, ("1", "0.2", 0.4), stage="tune", part="final0"),
     ]
     text = "stage = tune better than stage = her"
     sweep = sweep_of([*her, *searched], with_plan((), plan(text, stage="tune"), 5))
@@ -708,11 +669,7 @@ def test_equivalence_shows_the_90_percent_interval_and_tost_p(rng: np.random.Gen
 def test_conditions_at_a_bound_do_not_count_for_seeds_needed(
     rng: np.random.Generator,
 ) -> None:
-    runs = [
-        run({"tac.entropic_index": q, "tac.alpha": alpha}, seed, height, rng)
-        for q, alpha, height in (("1", "0.15", 0.3), ("1.5", "0.05", 0.0))
-        for seed in range(4)
-    ]
+    runs = cells(rng, 4, ("1", "0.15", 0.3), ("1.5", "0.05", 0.0))
     found = study_of(sweep_of(runs, BEFORE))
     assert len(found.planned) == 1
     assert power_in_words(found.planned, found.means, 1) is None
@@ -737,13 +694,9 @@ def test_stages_and_task_means_at_a_bound_do_not_count_either(rng: np.random.Gen
     between_q = "q = 1.5 against q = 1"
     both = ["FetchPush", "FetchSlide"]
     assert "spread does not show" in seeds_needed(both, between_q, {"a": 0.0})
-    one_condition = [
-        run({"tac.entropic_index": "1"}, seed, height, rng, stage=stage)
-        for stage, height in (("a", 0.3), ("b", 0.0))
-        for seed in range(5)
-    ]
+    first, second = (cells(rng, 5, ("1", h), stage=s) for s, h in (("a", 0.3), ("b", 0.0)))
     versions = with_plan((), plan("stage = a against stage = b", stage="a"), 5)
-    found = study_of(sweep_of(one_condition, versions))
+    found = study_of(sweep_of([*first, *second], versions))
     assert len(found.planned) == 1
     assert power_in_words(found.planned, found.means, 1) is None
 
@@ -751,12 +704,8 @@ def test_stages_and_task_means_at_a_bound_do_not_count_either(rng: np.random.Gen
 def test_only_fresh_seeds_of_a_search_are_compared(
     rng: np.random.Generator,
 ) -> None:
-    searched = [
-        run({"tac.entropic_index": q, "tac.alpha": alpha}, seed, 0.45, rng, part="trial0")
-        for q in ("1", "1.5")
-        for alpha in ("0.01", "0.1")
-        for seed in range(2)
-    ]
+    grid = itertools.product(("1", "1.5"), ("0.01", "0.1"), (0.45,))
+    searched = cells(rng, 2, *grid, part="trial0")
     fresh = [
         run({"tac.entropic_index": q, "tac.alpha": a}, 10**6 + seed, height, rng, part="final0")
         for q, a, height in (("1", "0.01", 0.2), ("1.5", "0.1", 0.4))
@@ -771,13 +720,9 @@ def test_only_fresh_seeds_of_a_search_are_compared(
 
 
 def test_a_hypothesis_can_compare_stages(rng: np.random.Generator) -> None:
-    runs = [
-        run({"tac.entropic_index": "1"}, seed, height, rng, stage=stage)
-        for stage, height in (("her", 0.2), ("music", 0.4))
-        for seed in range(5)
-    ]
+    her, music = (cells(rng, 5, ("1", h), stage=s) for s, h in (("her", 0.2), ("music", 0.4)))
     one = with_plan((), plan("stage = music better than stage = her", stage="music"), 5)
-    study = study_of(sweep_of(runs, one))
+    study = study_of(sweep_of([*her, *music], one))
     (claim,) = study.planned
     assert claim.confirmed is True
     assert [mean.condition.label for mean in study.means] == [

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import logging
 import os
-import subprocess
-import sys
 import warnings
 from collections.abc import Iterator
 
 import pytest
 
 from music_rllib.runtime import quiet
+from tests.processes import fresh
 
 NOTICE = "You are running PPO on the new API stack! This is the new default behavior"
 LOGGER = "ray.rllib.algorithms.algorithm_config"
@@ -61,10 +60,8 @@ def test_importing_the_robotics_environments_prints_nothing() -> None:
         "import gymnasium\n"
         "gymnasium.make('FetchPush-v4').close()\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
-    )
-    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    done = fresh("-c", code)
+    assert (done.stdout, done.stderr) == ("", "")
 
 
 # --- the environment -----------------------------------------------------------------------

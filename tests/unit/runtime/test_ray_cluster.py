@@ -21,6 +21,7 @@ from music_rllib.config.schema import Resources
 from music_rllib.runtime import ray_cluster
 from music_rllib.runtime.machine import ClusterError, own_folder, ray_parent
 from music_rllib.runtime.ray_cluster import WAITING, Capacity, _capacity, slots
+from tests.processes import fresh
 
 GIB = 2.0**30
 SMALL = {"CPU": 4.0, "memory": 8 * GIB}
@@ -145,9 +146,8 @@ owner.itself = owner
 
 def test_a_folder_is_removed_silently_if_its_owner_is_never_closed(tmp_path: Path) -> None:
     """The process ends, and Python finalizes the owner after that."""
-    command = [sys.executable, "-c", NEVER_CLOSED, str(tmp_path)]
-    ended = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (ended.returncode, ended.stderr, [*tmp_path.iterdir()]) == (0, "", [])
+    ended = fresh("-c", NEVER_CLOSED, tmp_path)
+    assert (ended.stderr, [*tmp_path.iterdir()]) == ("", [])
 
 
 @pytest.mark.parametrize(

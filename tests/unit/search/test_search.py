@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from pydantic import ValidationError
 
 from music_rllib import names
@@ -23,6 +22,7 @@ from music_rllib.search.sampler import VALUES, Proposer, trial_at
 from music_rllib.search.study import fits
 from music_rllib.store.history import Report
 from tests.played_search import Document, document
+from tests.sweep_files import loaded
 
 
 @pytest.mark.parametrize(
@@ -351,10 +351,8 @@ MISTAKES: list[tuple[Document, str]] = [
 
 @pytest.mark.parametrize(("search", "message"), MISTAKES, ids=[text[:45] for _, text in MISTAKES])
 def test_mistakes_in_a_search_are_named(search: Document, message: str, tmp_path: Path) -> None:
-    path = tmp_path / "sweep.yaml"
-    path.write_text(yaml.safe_dump(document(search), sort_keys=False))
     with pytest.raises(ConfigError) as error:
-        load_config(path)
+        loaded(tmp_path, document(search))
     assert message in str(error.value)
     assert "sweep.yaml:" in str(error.value)
 
@@ -370,10 +368,8 @@ def test_mistakes_in_a_search_are_named(search: Document, message: str, tmp_path
 def test_a_mistake_in_the_objective_is_one_error(
     objective: Any, message: str, tmp_path: Path
 ) -> None:
-    path = tmp_path / "sweep.yaml"
-    path.write_text(yaml.safe_dump(document({"objective": objective})))
     with pytest.raises(ConfigError) as error:
-        load_config(path)
+        loaded(tmp_path, document({"objective": objective}))
     (line,) = error.value.lines
     assert message in line
 
@@ -386,29 +382,23 @@ def test_success_needs_a_task_that_declares_it(objective: Any, tmp_path: Path) -
         {"name": "a", "variant": "tac", "search": content["stages"][1]["search"]},
     ]
     content["stages"][0]["search"]["objective"] = objective
-    path = tmp_path / "sweep.yaml"
-    path.write_text(yaml.safe_dump(content))
     with pytest.raises(ConfigError) as error:
-        load_config(path)
+        loaded(tmp_path, content)
     (line,) = error.value.lines
     assert "metric must be a metric that Swing has too, which declares no success" in line
     assert "write objective: {metric: evaluation/episode_return}, got" in line
     content["stages"][0]["search"]["objective"] = {"metric": names.EVAL_RETURN}
-    path.write_text(yaml.safe_dump(content))
-    load_config(path)
+    loaded(tmp_path, content)
 
 
 def test_a_rung_may_exceed_the_budget_of_shorter_tasks(tmp_path: Path) -> None:
     content = document({"pruning": {"rungs": [{"env_steps": 5000}]}})
     content["tasks"] = ["FetchPush", "FetchSlide"]
     content["stages"][1]["per_task"] = {"FetchSlide": {"env_steps": 6000}}
-    path = tmp_path / "sweep.yaml"
-    path.write_text(yaml.safe_dump(content))
-    load_config(path)
+    loaded(tmp_path, content)
     content["stages"][1]["per_task"]["FetchSlide"]["env_steps"] = 4500
-    path.write_text(yaml.safe_dump(content))
     with pytest.raises(ConfigError, match="must be <= 4500"):
-        load_config(path)
+        loaded(tmp_path, content)
 
 
 Q = {"float": [1.0, 2.0], "step": 0.25}
@@ -466,9 +456,7 @@ def test_no_point_is_tried_twice(sampler: str, space: Document, trials: int) -> 
 
 
 def test_a_search_with_few_points_prints_its_last_trial(tmp_path: Path) -> None:
-    path = tmp_path / "sweep.yaml"
-    path.write_text(yaml.safe_dump(document({"space": CHOICES, "trials": 20})))
-    (line,) = warnings_of(load_config(path))
+    (line,) = warnings_of(loaded(tmp_path, document({"space": CHOICES, "trials": 20})))
     assert line == (
         "finetune: search.trials is 20, and the space has 9 points: the search ends after 9 trials"
     )

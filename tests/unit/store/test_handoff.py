@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays_of
 
-from music_rllib.config.run_settings import RunSettings, variant_music
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.store.handoff import (
     HandoffError,
@@ -20,13 +19,11 @@ from music_rllib.store.handoff import (
     read_handoff,
     write_handoff,
 )
-from tests.hostile_files import SPACES
+from tests.handoffs import music_u
+from tests.hostile_files import SPACES, Bomb
 
 PUSH, SLIDE = BUILT_IN_TASKS["FetchPush"], BUILT_IN_TASKS["FetchSlide"]
-RUN = RunSettings.model_validate(
-    {"task": PUSH, "variant": "music-u", "seed": 0, "music": variant_music("music-u", PUSH)}
-)
-INFO = RUN.handoff_info("0" * 20, 6000, SPACES)
+INFO = music_u().handoff_info("0" * 20, 6000, SPACES)
 WEIGHTS: NetworkWeights = {
     "mi_estimator": {"x.weight": np.arange(6, dtype=np.float32).reshape(2, 3)},
     "normaliser": {"count": np.array(7, np.int64), "mean": np.linspace(0, 1, 5)},
@@ -97,16 +94,6 @@ def test_damage_is_named(handoff: Path) -> None:
     assert "its content has changed" in refusal(handoff)
     (handoff / "handoff.json").write_text("{")
     assert "must be a handoff manifest" in refusal(handoff)
-
-
-class Bomb:
-    """An object that creates a file when it is unpickled."""
-
-    def __init__(self, trace: Path) -> None:
-        self.trace = trace
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return (Path.touch, (self.trace,))
 
 
 def forge(handoff: Path, data: bytes, **changes: Any) -> None:

@@ -6,21 +6,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import psutil
 import pytest
 import torch
 import yaml
 
 from music_rllib.command_line import console_for
-from music_rllib.config.load import load_config
-from music_rllib.config.run_settings import RunSettings, variant_music
-from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.experiment.open_sweep import OpenSweep, open_sweep
 from music_rllib.program import main
-from music_rllib.store.handoff import write_handoff
 from music_rllib.sweep import driver, execution
-from tests.hostile_files import SPACES
+from tests.handoffs import music_u, write_estimator
+from tests.sweep_files import loaded
 
 Document = dict[str, Any]
 
@@ -87,13 +83,6 @@ def test_plan_shows_the_runs_and_leaves_nothing(program: Program, tmp_path: Path
     assert [path.name for path in tmp_path.iterdir()] == ["sweep.yaml"]
 
 
-def test_without_a_file_the_packaged_sweep_runs(program: Program) -> None:
-    result = program(None, "plan")
-    assert result.exit_code == 0
-    assert "No CONFIG given" in result.output
-    assert "tac.entropic_index: 1, 1.5, 2" in result.output
-
-
 def test_options_replace_name_and_storage(program: Program, tmp_path: Path) -> None:
     result = program(document(), "--name", "other", "--storage", "elsewhere", command="plan")
     assert "Sweep other" in result.output
@@ -124,8 +113,7 @@ def test_the_mlflow_file_of_a_slurm_task_is_not_recorded(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """`resume` would log to a file that is deleted when the task ends."""
-    (tmp_path / "sweep.yaml").write_text(json.dumps(document()))
-    config = load_config(tmp_path / "sweep.yaml")
+    config = loaded(tmp_path, document())
     monkeypatch.setenv("MLFLOW_TRACKING_URI", uri := f"sqlite:///{tmp_path}/own/mlflow.db")
     seen = driver._with_environment(console_for(), config)
     assert (seen.mlflow.tracking_uri, seen.document["mlflow"]["tracking_uri"]) == (uri, uri)
@@ -256,41 +244,6 @@ def test_files_that_are_none(program: Program, tmp_path: Path) -> None:
     assert (result.exit_code, "torn.yaml:1: must be valid YAML" in result.stderr) == (2, True)
 
 
-def handoff(folder: Path, task_name: str) -> Path:
-    task = BUILT_IN_TASKS[task_name]
-    run = RunSettings.model_validate(
-        {"task": task, "variant": "music-u", "seed": 0, "music": variant_music("music-u", task)}
-    )
-    weights = {"mi_estimator": {"w": np.zeros((4, 4), np.float32)}}
-    write_handoff(folder, weights, run.handoff_info("0" * 20, 1, SPACES))
-    return folder
-
-
-@pytest.mark.parametrize(
-    ("task", "tamper", "message"),
-    [
-        ("FetchSlide", lambda _: None, "must be of task FetchPush, got one of FetchSlide"),
-        ("FetchPush", lambda data: data[:-3], "must have 136 bytes, it has 133"),
-        ("FetchPush", lambda data: data[:-1] + b"x", "its content has changed"),
-    ],
-    ids=["foreign", "truncated", "flipped"],
-)
-def test_checkpoints_that_do_not_fit(
-    program: Program,
-    tmp_path: Path,
-    task: str,
-    tamper: Callable[[bytes], bytes | None],
-    message: str,
-) -> None:
-    folder = handoff(tmp_path / "handoff", task)
-    weights = folder / "mi_estimator.safetensors"
-    weights.write_bytes(tamper(weights.read_bytes()) or weights.read_bytes())
-    result = program(from_checkpoint(folder))
-    assert result.exit_code == 2
-    assert "stages.f.init_from" in result.stderr
-    assert message in result.stderr
-
-
 @pytest.mark.parametrize(
     ("address", "message"),
     [
@@ -322,7 +275,7 @@ def test_a_damaged_node_that_others_start_from(
     program(document(stages=[PRETRAIN, finetune]), command="plan")
     key = opened[-1].plan.nodes[0].key
     produced = tmp_path / "produced"
-    handoff(produced / "handoff", "FetchPush")
+    write_estimator(produced / "handoff", music_u())
     opened[-1].store.publish(key, produced)
     node = tmp_path / "results" / "nodes" / key
     (node / "handoff" / "handoff.json").write_text("{}")
@@ -363,6 +316,7 @@ def test_values_of_the_command_line_are_recorded(
 def test_without_a_file_the_command_line_changes_the_packaged_sweep(program: Program) -> None:
     result = program(None, "plan", "seeds=2", "stages.reach.grid.tac.entropic_index=[1, 1.5, 2, 3]")
     assert result.exit_code == 0, result.stderr
+    assert "No CONFIG given" in result.output
     assert "2 seeds\n  tac.entropic_index: 1, 1.5, 2, 3\n" in result.output
 
 

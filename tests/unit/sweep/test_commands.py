@@ -17,7 +17,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pyarrow.fs as pafs
 import pytest
 import yaml
@@ -26,7 +25,6 @@ from rich.console import Console
 
 from music_rllib import names
 from music_rllib.config.load import load_config
-from music_rllib.config.run_settings import RunSettings
 from music_rllib.experiment import open_sweep as open_sweep_module
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.open_sweep import (
@@ -51,7 +49,6 @@ from music_rllib.results.tables import performance_tables
 from music_rllib.store import lease as lease_module
 from music_rllib.store import node_store
 from music_rllib.store import storage as storage_module
-from music_rllib.store.handoff import write_handoff
 from music_rllib.store.history import HISTORY, Report, RunResult, to_json_lines
 from music_rllib.store.lease import Lease, LeaseFile
 from music_rllib.store.storage import DamagedError, StorageFolder
@@ -60,7 +57,8 @@ from music_rllib.sweep.export import sweep_of_run
 from music_rllib.sweep.listeners.state_file import StateFile
 from music_rllib.sweep.preflight import import_checkpoints
 from music_rllib.sweep.views.results import console_table
-from tests.hostile_files import SPACES
+from tests.handoffs import music_u, write_estimator
+from tests.sweep_files import loaded
 
 REPOSITORY = Path(__file__).parents[3]
 SWEEP: dict[str, Any] = {
@@ -131,9 +129,7 @@ def program(capsys: pytest.CaptureFixture[str]) -> Program:
 
 
 def opened(storage: str, tmp_path: Path, **changes: Any) -> OpenSweep:
-    path = tmp_path / "sweep.yaml"
-    path.write_text(yaml.safe_dump(SWEEP | changes))
-    config = load_config(path, storage=storage)
+    config = loaded(tmp_path, SWEEP | changes, storage=storage)
     sweep = open_sweep(config, make_plan(config), storage)
     keep_record(sweep)
     return sweep
@@ -300,9 +296,8 @@ def test_what_best_writes_is_the_run_to_the_last_setting(name: str, tmp_path: Pa
     config = load_config(REPOSITORY / file, storage=str(tmp_path))
     sweep = open_sweep(config, make_plan(config), str(tmp_path))
     for key in {(node.stage, node.run.task.name): node.key for node in sweep.plan.nodes}.values():
-        path = tmp_path / "run.yaml"
-        path.write_text(yaml.safe_dump(sweep_of_run(sweep, key, tmp_path)))
-        assert make_plan(load_config(path)).nodes[-1].key == key
+        of_run = loaded(tmp_path, sweep_of_run(sweep, key, tmp_path))
+        assert make_plan(of_run).nodes[-1].key == key
 
 
 def test_a_condition_with_all_its_runs_is_better_than_a_lucky_one(
@@ -601,21 +596,11 @@ def test_clean_all_leaves_no_last_checkpoint_of_a_shorter_run(
 
 def from_handoff(storage: str, tmp_path: Path, name: str = "mine") -> OpenSweep:
     """A sweep of one run from a handoff in `tmp_path`, which has been copied into the storage."""
-    folder = tmp_path / "given"
-    pretrained = resolved(SWEEP | {"stages": [{"name": "p", "variant": "music-u"}]}, tmp_path)
-    arrays = {"mi_estimator": {"w": np.zeros((3, 2), np.float32)}}
-    write_handoff(folder, arrays, pretrained.handoff_info("0" * 20, 50, SPACES))
+    folder = write_estimator(tmp_path / "given", music_u())
     stage = {"name": "r", "variant": "music-r", "init_from": {"checkpoint": str(folder)}}
     sweep = opened(storage, tmp_path, name=name, seeds=[0], stages=[stage])
     import_checkpoints(sweep.plan, sweep.store)
     return sweep
-
-
-def resolved(document: dict[str, Any], tmp_path: Path) -> RunSettings:
-    """Settings of the first run."""
-    path = tmp_path / "resolved.yaml"
-    path.write_text(yaml.safe_dump(document))
-    return next(iter(load_config(path).stages[0].points[0].runs.values()))
 
 
 def test_a_sweep_resumes_from_the_handoff_in_its_storage(

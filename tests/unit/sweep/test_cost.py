@@ -4,14 +4,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
-from music_rllib.config.load import load_config
 from music_rllib.experiment.plan import make_plan
 from music_rllib.runtime import machine
 from music_rllib.sweep.views import cost
 from music_rllib.sweep.views.cost import RunGroup, run_groups
 from music_rllib.training.sample_run import RunSample
+from tests.sweep_files import loaded
 
 
 def kinds(folder: Path, finished: int = 0, **changes: Any) -> list[RunGroup]:
@@ -28,9 +27,7 @@ def kinds(folder: Path, finished: int = 0, **changes: Any) -> list[RunGroup]:
             },
         ],
     }
-    path = folder / "s.yaml"
-    path.write_text(yaml.safe_dump(document | changes))
-    config = load_config(path)
+    config = loaded(folder, document | changes)
     plan = make_plan(config)
     return run_groups(config, plan, {node.key for node in plan.nodes[:finished]})
 

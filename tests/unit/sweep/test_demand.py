@@ -6,9 +6,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-import yaml
 
-from music_rllib.config.load import load_config
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.runtime.ray_cluster import Capacity
 from music_rllib.sweep.preflight import (
@@ -16,6 +14,7 @@ from music_rllib.sweep.preflight import (
     check_demand,
     check_memory,
 )
+from tests.sweep_files import loaded
 
 GIB = 2**30
 
@@ -27,9 +26,7 @@ def run(tmp_path: Any, **defaults: Any) -> RunSettings:
         "defaults": defaults,
         "stages": [{"name": "a", "variant": "music-u"}],
     }
-    path = tmp_path / "sweep.yaml"
-    path.write_text(yaml.safe_dump(document))
-    return load_config(path).stages[0].points[0].runs["FetchPush"]
+    return loaded(tmp_path, document).stages[0].points[0].runs["FetchPush"]
 
 
 @pytest.mark.parametrize(

@@ -6,15 +6,14 @@ from typing import Any
 import pytest
 import ray
 import ray.util.metrics
-import yaml
 
 from music_rllib import names
-from music_rllib.config.load import load_config
 from music_rllib.experiment.plan import Plan, make_plan
 from music_rllib.experiment.scheduler import Scheduler
 from music_rllib.store.history import Report, RunResult
 from music_rllib.sweep.listeners.prometheus import PrometheusListener
 from music_rllib.tracking.sender import Pending
+from tests.sweep_files import loaded
 
 KEPT = 3
 
@@ -46,8 +45,7 @@ def plan(tmp_path: Path) -> Plan:
         "seeds": list(range(8)),
         "stages": [{"name": "train", "variant": "tac"}],
     }
-    (tmp_path / "s.yaml").write_text(yaml.safe_dump(document))
-    return make_plan(load_config(tmp_path / "s.yaml"))
+    return make_plan(loaded(tmp_path, document))
 
 
 def report(env_steps: int, success: float) -> Report:

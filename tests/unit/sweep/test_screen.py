@@ -7,12 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 from rich.console import Console, RenderableType
 
 from music_rllib import names
 from music_rllib.command_line import clock, percent
-from music_rllib.config.load import load_config
 from music_rllib.config.schema import SweepConfig
 from music_rllib.config.tac_settings import LearnedAlpha, setting_text
 from music_rllib.experiment.plan import Plan, make_plan
@@ -24,6 +22,7 @@ from music_rllib.store.storage import resolve_storage, sweep_folder
 from music_rllib.sweep.listeners.screen import Display
 from music_rllib.sweep.views.plan import alpha_rows, plan_view
 from music_rllib.sweep.views.results import results_table
+from tests.sweep_files import loaded
 
 DOCUMENT: dict[str, Any] = {
     "name": "s",
@@ -43,15 +42,13 @@ DOCUMENT: dict[str, Any] = {
 }
 
 
-def loaded(folder: Path, **changes: Any) -> SweepConfig:
-    path = folder / "s.yaml"
-    path.write_text(yaml.safe_dump(DOCUMENT | changes, sort_keys=False))
-    return load_config(path)
+def changed(folder: Path, **changes: Any) -> SweepConfig:
+    return loaded(folder, DOCUMENT | changes)
 
 
 @pytest.fixture
 def config(tmp_path: Path) -> SweepConfig:
-    return loaded(tmp_path)
+    return changed(tmp_path)
 
 
 @pytest.fixture
@@ -88,7 +85,7 @@ def test_the_plan_counts_runs_budgets_and_finished_runs(config: SweepConfig, pla
 def test_settings_that_vary_together_are_shown_together(tmp_path: Path) -> None:
     tuned = [{"entropic_index": 1.0, "alpha": 0.15}, {"entropic_index": 1.5, "alpha": 0.05}]
     stage = {"name": "her", "variant": "tac", "grid": {"tac": tuned}}
-    config = loaded(tmp_path, stages=[stage])
+    config = changed(tmp_path, stages=[stage])
     plan = make_plan(config)
     text = shown(plan_view(config, plan, set()))
     assert "\n  tac.entropic_index, tac.alpha: 1, 0.15; 1.5, 0.05\n" in text
@@ -114,7 +111,7 @@ def test_the_plan_shows_the_alpha_of_a_control_at_each_q(tmp_path: Path) -> None
         },
         {"name": "plain", "variant": "tac", "grid": {"tac.alpha": [0.05, 0.1]}},
     ]
-    rows = alpha_rows(make_plan(loaded(tmp_path, stages=stages)))
+    rows = alpha_rows(make_plan(changed(tmp_path, stages=stages)))
     # G = q^(-1/2) (sqrt(2 pi) sigma)^(1-q) at q = 2; of four dimensions, its fourth power.
     pressure = 2**-0.5 / ((2 * math.pi) ** 0.5 * 0.1)
     assert [(row["stage"], row["q"]) for row in rows] == [
@@ -124,7 +121,7 @@ def test_the_plan_shows_the_alpha_of_a_control_at_each_q(tmp_path: Path) -> None
     ]
     assert [row["at_start"] for row in rows] == pytest.approx([0.05, 0.05 / pressure, 0.05])
     assert rows[2]["at_end"] == pytest.approx(0.05 / pressure**4)
-    config = loaded(tmp_path, stages=stages)
+    config = changed(tmp_path, stages=stages)
     assert "0.05 matched at 0.1" in shown(plan_view(config, make_plan(config), ()))
 
 
@@ -132,7 +129,7 @@ def test_alpha_of_a_q_that_follows_a_measurement_ends_at_its_last_point(tmp_path
     q = {"follows": "success_rate", "points": [[0.2, 2.0], [0.9, 1.0]], "monotone": True}
     alpha = {"value": 0.05, "matched_width": 0.1}
     stage = {"name": "her", "variant": "tac", "grid": {"tac.entropic_index": [q, 1.0]}}
-    plan = make_plan(loaded(tmp_path, stages=[stage | {"tac": {"alpha": alpha}}]))
+    plan = make_plan(changed(tmp_path, stages=[stage | {"tac": {"alpha": alpha}}]))
     row = alpha_rows(plan)[1]
     assert (row["q"], row["q_at_start"], row["at_end"]) == ("2 to 1 by success rate", 2.0, 0.05)
     assert color_of(row["q"]) == color_of("1"), "it has that of its last value"
@@ -265,7 +262,7 @@ REACHER = {"Reacher": {"env_id": "Reacher-v5", "horizon": 50, "success_key": Non
 def test_tasks_without_success_are_shown_by_their_return(tmp_path: Path) -> None:
     stages = [{"name": "train", "variant": "tac"}]
     tasks = ["Reacher", "FetchReach"]
-    config = loaded(tmp_path, environments=REACHER, tasks=tasks, stages=stages, seeds=[0])
+    config = changed(tmp_path, environments=REACHER, tasks=tasks, stages=stages, seeds=[0])
     plan = make_plan(config)
     metrics = {names.EVAL_RETURN: -5.25, names.EVAL_EPISODES: 5.0}
     success = {names.EVAL_SUCCESS: 0.5, names.EVAL_RETURN: -20.0}
@@ -299,7 +296,7 @@ def test_no_cell_is_cut(tmp_path: Path) -> None:
     grid = {"tac.entropic_index": [1.0, 1.5], "tac.alpha": [0.05, 0.1]}
     stage = {"name": "train-all-of-it", "variant": "tac", "env_steps": 1_000_000, "grid": grid}
     tasks = ["Reacher", "FetchPickAndPlace"]
-    config = loaded(tmp_path, environments=REACHER, tasks=tasks, stages=[stage])
+    config = changed(tmp_path, environments=REACHER, tasks=tasks, stages=[stage])
     plan = make_plan(config)
     metrics = {names.EVAL_RETURN: -1234.5, names.EVAL_SUCCESS: 0.25, names.EVAL_SUCCESS_ANY: 0.5}
     result = RunResult(label="x", env_steps=1_000_000, seconds=40_000, metrics=metrics)
@@ -336,7 +333,7 @@ def test_random_steps_do_not_count_for_the_speed_of_learning(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("music_rllib.sweep.listeners.screen.PROGRESS_SECONDS", 0.0)
-    plan = make_plan(loaded(tmp_path, defaults={"tac": {"random_steps": 1000}}))
+    plan = make_plan(changed(tmp_path, defaults={"tac": {"random_steps": 1000}}))
     node, console = plan.nodes[-1], screen()
     with Display(console[0], plan, Scheduler(plan, finished=()), time := Clock()) as display:
         display.started(node)

@@ -6,14 +6,13 @@ import json
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from music_rllib import names
 from music_rllib.config.load import load_config
 from music_rllib.config.schema import SweepConfig
 from music_rllib.experiment.plan import Plan, make_plan
 from music_rllib.experiment.run_info import run_name
 from music_rllib.sweep.listeners.mlflow_view import comparison_view
+from tests.sweep_files import loaded
 
 ROOT = Path(__file__).parents[3]
 STAGES: list[dict[str, Any]] = [
@@ -32,9 +31,7 @@ STAGES: list[dict[str, Any]] = [
 
 
 def config(folder: Path, tasks: list[str]) -> SweepConfig:
-    file = folder / "sweep.yaml"
-    file.write_text(yaml.safe_dump({"name": "s", "tasks": tasks, "seeds": 2, "stages": STAGES}))
-    return load_config(file)
+    return loaded(folder, {"name": "s", "tasks": tasks, "seeds": 2, "stages": STAGES})
 
 
 def plan(folder: Path, tasks: list[str]) -> Plan:
@@ -49,8 +46,8 @@ def test_a_run_s_name_begins_with_its_varied_settings(tmp_path: Path) -> None:
 
 
 def test_the_view_has_a_line_for_each_condition_of_the_compared_stage(tmp_path: Path) -> None:
-    loaded = config(tmp_path, ["FetchPush", "FetchSlide"])
-    view = json.loads(comparison_view(make_plan(loaded), loaded.stage(), "c0ffee", 1.5))
+    swept = config(tmp_path, ["FetchPush", "FetchSlide"])
+    view = json.loads(comparison_view(make_plan(swept), swept.stage(), "c0ffee", 1.5))
     assert (view["name"], view["createdAt"]) == ("s: comparison", 1500)
     state = json.loads(view["state"])
     current = "tags.sweep_id = 'c0ffee' and tags.current = 'yes'"
@@ -65,11 +62,9 @@ def test_the_view_has_a_line_for_each_condition_of_the_compared_stage(tmp_path: 
 
 
 def test_the_view_of_a_search_has_its_trials_of_which_none_is_planned_yet() -> None:
-    loaded = load_config(ROOT / "tune_configs" / "search.yaml")
-    stage = loaded.stage()
-    state = json.loads(
-        json.loads(comparison_view(make_plan(loaded), stage, "c0ffee", 1.5))["state"]
-    )
+    swept = load_config(ROOT / "tune_configs" / "search.yaml")
+    stage = swept.stage()
+    state = json.loads(json.loads(comparison_view(make_plan(swept), stage, "c0ffee", 1.5))["state"])
     assert state["searchFilter"].endswith(f"tags.stage = '{stage.name}'")
     assert stage.search is not None
     assert "tac.alpha" in stage.search.space
