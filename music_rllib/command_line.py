@@ -132,13 +132,7 @@ def console_for(*, as_json: bool = False, unfailing: bool = False) -> Console:
 
 
 def new_table(title: str, heads: Iterable[str], left: Collection[str] = ()) -> Table:
-    """A table whose cells are folded and never cut.
-
-    Args:
-        title: Text above it.
-        heads: Heads of its columns, in order.
-        left: Heads of the left-aligned columns of text; numbers are right-aligned.
-    """
+    """A table whose cells are folded and never cut; columns of text, `left`, are left-aligned."""
     from rich.table import Table
 
     table = Table(title=title, title_justify="left", box=None, pad_edge=False, padding=(0, 2, 0, 0))

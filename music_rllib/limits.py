@@ -130,10 +130,7 @@ def read_json(data: bytes | str) -> Any:
 
 
 def check_safetensors(data: bytes) -> None:
-    """Check the size of a safetensors file's header before anything parses it.
-
-    Args:
-        data: The file's content, or its first 8 bytes.
+    """Check the size of a safetensors file's header, in its first 8 bytes, before it is parsed.
 
     Raises:
         ValueError: It is too large.

@@ -125,12 +125,8 @@ def for_people(text: object) -> str:
 def without_secrets(settings: Mapping[str, object], *, of_tasks: bool = False) -> dict[str, object]:
     """A copy of nested ``settings`` with redacted text and without keys that name a secret.
 
-    A key names a secret if it contains a word of `redact`. ``n_tokens: 4`` and the names of tasks
-    are not secrets.
-
-    Args:
-        settings: The settings.
-        of_tasks: Whether their keys are names of tasks.
+    A key names a secret if it contains a word of `redact`. ``n_tokens: 4`` and the names of tasks,
+    which are the keys if ``of_tasks``, are not secrets.
     """
     return {
         str(key): _clean(str(key), value)

@@ -205,8 +205,6 @@ def value_at(
     """The schedule's value after `env_steps` of `total_env_steps` environment steps.
 
     Args:
-        schedule: The schedule.
-        env_steps: Environment steps done.
         total_env_steps: The run's budget.
         measured: The quantity that a `Measured` follows; None before the first measurement.
     """

@@ -120,12 +120,9 @@ def merge(
     """Merge variant, defaults, stage, its `per_task` and one point of its grid or search.
 
     Args:
-        variant: The stage's variant.
-        task: The run's task.
         defaults: The sweep's `defaults`, with those of its preset.
         stage: The stage's own settings, keys of `LAYER_KEYS` and `per_task` only.
         stage_path: The stage's place in the document.
-        point: The point.
 
     Returns:
         The merged settings, and the problems of their layers.

@@ -174,12 +174,9 @@ def _check_keys(node: yaml.MappingNode) -> None:
 def _check_values(node: yaml.Node, counts: dict[int, int | None]) -> int:
     """Count the values in `node`; the values of an alias count at each of its uses.
 
-    Call it before construction, which copies the keys of a `<<` into its mapping.
-
-    Args:
-        node: The node; too many values in it are an error.
-        counts: Id of a node to its count; None while it is being counted. Each node is visited
-            once, because nine nested aliases can stand for a thousand million values.
+    Too many values are an error. Call it before construction, which copies the keys of a `<<` into
+    its mapping. `counts` maps the id of a node to its count, or to None while it is being counted:
+    each node is visited once, because nine nested aliases can stand for a thousand million values.
     """
     if id(node) in counts:
         count = counts[id(node)]

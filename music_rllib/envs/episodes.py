@@ -212,7 +212,6 @@ def first_mismatch(
     rewards of goals that round to the same float32, for example at a threshold.
 
     Args:
-        reward: the function that hindsight uses.
         goals: [n+1, 2G] desired and achieved goals of an episode.
         given: [n] rewards of its steps.
 
@@ -251,7 +250,6 @@ def lost_by_rounding(reward: GoalReward, achieved: Goals, distance: float) -> st
     Goals far from the origin, such as UTM coordinates, lose the digits on which rewards depend.
 
     Args:
-        reward: the function that hindsight uses.
         achieved: an achieved goal as the environment returns it.
         distance: typical distance of achieved and desired goals.
     """

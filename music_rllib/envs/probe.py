@@ -69,9 +69,7 @@ class RefusedError(Exception):
 class Probe:
     """Play the environment of one task, and collect problems and remarks.
 
-    Args:
-        question: the task.
-        watch: called with the name of each call of the environment, before it.
+    `watch` is called with the name of each call of the environment, before it.
     """
 
     def __init__(self, question: Question, watch: Callable[[str], None]) -> None:

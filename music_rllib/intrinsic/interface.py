@@ -107,7 +107,6 @@ class IntrinsicReward(nn.Module, ABC):
         """[B] rewards in [-1, 0] as MUSIC's: clip(bonus / scale, 0, 1) - 1; and [B] bonuses.
 
         Args:
-            batch: the transitions.
             learning: whether the bonuses count for the scale.
 
         Raises:

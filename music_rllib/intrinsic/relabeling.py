@@ -181,13 +181,10 @@ class RewardLearner:
 
 
 def _check_own_class(batch: Batch, make: Callable[[], RewardLearner]) -> None:
-    """Check that a user's reward leaves a minibatch as it is, and resumes exactly.
+    """Raise a ValueError unless a user's reward leaves a minibatch as it is, and resumes exactly.
 
     Otherwise the critics would learn from changed data, and a resumed run would differ, both
     without an error.
-
-    Raises:
-        ValueError: It does not.
     """
 
     def learned(learner: RewardLearner) -> Tensor:

@@ -4,7 +4,9 @@ A loss is a mean over the minibatch. A derivative is by the loss's own arguments
 it on to the networks. Arithmetic of single numbers is in float64.
 
 Shape legend: B batch, A action dimensions, C critics, M quantiles of a critic (1: its mean),
-T atoms of a target (1: its mean).
+T atoms of a target (1: its mean). `action` [B, A] is the policy's, `ln_q_pi` [B] is ln_q of its
+density, `smallest` [B] the smallest critic there, `alpha` the entropy coefficient; `gradient`
+receives the derivative.
 """
 
 from __future__ import annotations
@@ -40,7 +42,7 @@ def critic_loss(
         target: [B, T]
         weights: [B] importance weights, or empty for 1.
         fractions: [M] of quantiles, for `_quantile_loss`; empty: `_squared_loss`.
-        gradient: [C, B, M] receives the derivative.
+        gradient: [C, B, M]
     """
     if len(fractions) == 0:
         loss: float = _squared_loss(outputs, target, weights, gradient)
@@ -176,9 +178,9 @@ def policy_value_backward(values: Array, smallest: Array, averaged: int, gradien
 
     Args:
         values: [C, B] critics at the policy's actions.
-        smallest: [B] the smallest of them, unless critics are averaged.
+        smallest: unused if critics are averaged.
         averaged: number of critics whose mean is Q, the first ones; 0: Q is the smallest one.
-        gradient: [C, B] receives the derivative by each critic.
+        gradient: [C, B]
     """
     count, rows = values.shape
     for r in range(rows):
@@ -198,15 +200,7 @@ def policy_value_backward(values: Array, smallest: Array, averaged: int, gradien
 def policy_loss(
     action: Array, ln_q_pi: Array, improved: Array, alpha: float, action_l2: float
 ) -> float:
-    """The mean of alpha ln_q pi - Q + w a^2 (paper eq. 10).
-
-    Args:
-        action: [B, A] of the policy.
-        ln_q_pi: [B] ln_q of its density.
-        improved: [B] Q at the action.
-        alpha: entropy coefficient.
-        action_l2: w.
-    """
+    """The mean of alpha ln_q pi - Q + w a^2 (paper eq. 10); Q is `improved` [B], w `action_l2`."""
     rows, size = action.shape
     loss = 0.0
     for r in range(rows):
@@ -223,11 +217,8 @@ def policy_loss_backward(
     """Complete the derivatives of `policy_loss` in place.
 
     Args:
-        action: [B, A] of the policy.
         of_action: [B, A] derivative of -Q by the action, to which 2 w a / (B A) is added.
         slopes: [B, A] derivative of ln_q pi by ln p, which is multiplied by alpha / B.
-        alpha: entropy coefficient.
-        action_l2: w.
     """
     rows, size = of_action.shape
     for r in range(rows):
@@ -242,14 +233,9 @@ def policy_loss_backward(
 def value_loss(
     values: Array, smallest: Array, ln_q_pi: Array, alpha: float, gradient: Array
 ) -> float:
-    """1/2 mean (V - (min Q - alpha ln_q pi))^2 (paper eq. 8).
+    """1/2 mean (V - (min Q - alpha ln_q pi))^2 (paper eq. 8), with V `values` [B, 1].
 
-    Args:
-        values: [B, 1] V of the states.
-        smallest: [B] min Q at the policy's action.
-        ln_q_pi: [B] ln_q of its density.
-        alpha: entropy coefficient.
-        gradient: [B, 1] receives the error / B.
+    `gradient` [B, 1] receives the error / B.
     """
     rows, loss = len(values), 0.0
     for r in range(rows):
@@ -266,7 +252,6 @@ def alpha_loss_backward(
     """Derivative of a learned alpha's loss by ln alpha: a mean of the policy minus its target.
 
     Args:
-        ln_q_pi: [B] ln_q of the density.
         log_density: [B, A] ln of the density.
         log_std: [B, A] ln of the standard deviation.
         measure: 0: the entropy S_q; 1: the Shannon entropy; 2: the mean of `log_std`.

@@ -346,10 +346,8 @@ def _compiled_for(sources: str) -> Any:
         Args:
             transitions: [K*B] pairs of frames, whose bounds are computed before their update.
             trajectories: [K*N] training data, concatenated minibatches.
-            bound: the kind of bound.
             weights: views of `step.values`.
             by: views of `step.gradients`.
-            step: arguments of Adam.
             updates: K.
 
         Returns:

@@ -82,11 +82,7 @@ def film(
 
 
 def _sizes(policy: Policy) -> dict[str, int]:
-    """Size options of environments that MuJoCo draws; others choose their own size.
-
-    Raises:
-        VideoError: The environment can't be drawn.
-    """
+    """Size options if MuJoCo draws the environment, else none; a VideoError if nothing can."""
     env = open_task(policy)
     modes = env.metadata.get("render_modes") or []
     by_mujoco = hasattr(env.unwrapped, "mujoco_renderer")

@@ -89,7 +89,6 @@ def build_report(
         damaged: A sentence about finished runs that are damaged in the storage; empty if none is.
         command: The command that makes this report.
         storage: The storage that has the policies for videos; None for an exported sweep.
-        videos: Whether to record videos.
         environments: Tasks of the user that videos may show, in addition to the built-in ones.
         both: The two sweeps that `sweep` consists of, in a report on two sweeps.
         live: Whether the sweep is running, so that waiting runs are not reported as missing.

@@ -53,10 +53,7 @@ def difference_tables(
 ) -> list[Table]:
     """Settings that differ, and the final values of all conditions in both sweeps.
 
-    Args:
-        first: The first sweep.
-        second: The second sweep.
-        analyses: The analyses of the sweep that :func:`joined_sweeps` makes of them.
+    The `analyses` are those of the sweep that :func:`joined_sweeps` makes of them.
     """
     titles = titles_of(first, second)
     return [_settings_table(first, second, titles), _results_table(analyses, titles)]

@@ -60,13 +60,8 @@ def make_videos(
 ) -> Videos:
     """Record the last stage's policies on the built-in tasks and in the user's `environments`.
 
-    It never fails: the result has the reason why a video is missing.
-
-    Args:
-        sweep: The sweep.
-        analyses: The analyses of its stages.
-        storage: The storage that has the policies; None for an exported sweep.
-        environments: Tasks of the user.
+    It never fails: the result has the reason why a video is missing. An exported sweep has no
+    `storage` with policies.
     """
     if storage is None:
         return Videos(missing="an exported sweep has no policies; report on the sweep itself")

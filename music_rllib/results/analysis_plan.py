@@ -249,9 +249,7 @@ def is_controlled(alpha: str) -> bool:
 def _budget(stages: Sequence[Stage], pretrained_in: SweepConfig | None) -> dict[str, int]:
     """Smallest budget of each task in any stage; in a search, of its runs on fresh seeds.
 
-    Args:
-        stages: The stages.
-        pretrained_in: The sweep whose pretraining stages count; None: pretraining does not count.
+    Pretraining stages of the sweep `pretrained_in` count; None: pretraining does not count.
     """
     budget: dict[str, int] = {}
     for stage in stages:

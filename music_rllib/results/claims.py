@@ -147,12 +147,10 @@ def _far_off(scores: Array, margin: float) -> Array:
 
 
 def _student(x: Array, y: Array, paired: bool) -> tuple[Array, Array, Array]:
-    """Student's test of pairs, or Welch's test, along the seeds.
+    """Standard deviation of a difference, standard error of its mean, degrees of freedom.
 
-    Equal to scipy's `ttest_rel` and `ttest_ind`, which warn if a condition has no spread.
-
-    Returns:
-        Standard deviation of a difference, standard error of its mean, degrees of freedom.
+    Student's test of pairs, or Welch's test, along the seeds. They equal scipy's `ttest_rel` and
+    `ttest_ind`, which warn if a condition has no spread.
     """
     samples = [x - y] if paired else [x, y]
     variances = np.stack([np.var(sample, axis=0, ddof=1) for sample in samples])
@@ -275,7 +273,6 @@ def claims_of(
     """Claims without a verdict, on each task and on all tasks if these have the same unit.
 
     Args:
-        sweep: The runs.
         comparisons: Two labels each, and the pairs of conditions that they name.
         measures: Task to measure.
         margin: Margin of equivalence; None: the default for success rates.

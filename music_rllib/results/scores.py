@@ -90,12 +90,9 @@ def measure_on(
     is known, else the worst score of the compared runs.
 
     Args:
-        sweep: The runs.
-        task: The task.
         runs: Positions of all runs that are compared.
         kind: As in `Measure`, like `maximised`.
-        metric: The metric; None: the task's primary one.
-        maximised: Whether higher values are better.
+        metric: None: the task's primary one.
         horizon: Largest number of environment steps.
     """
     own = [run for run in runs if sweep.runs[run].task == task]
@@ -113,10 +110,7 @@ def measure_on(
 def has_failed(sweep: Sweep, run: int, metric: str | None = None) -> bool:
     """Whether a run ended with an error, or diverged to a score that is not a number.
 
-    Args:
-        sweep: The runs.
-        run: Position of the run.
-        metric: Metric of the score; None: the primary one.
+    The metric of the score is `metric`, or the primary one.
     """
     record = sweep.runs[run]
     values = sweep.column(run, metric or sweep.primary_metric(record.task)).value

@@ -105,7 +105,6 @@ def interval_of_mean(
     side away from a bound. If all runs tie, it is the exact interval over their episodes.
 
     Args:
-        value: The mean.
         variance: Variance of the mean.
         freedom: Degrees of freedom of `variance`; 0 or NaN: no interval.
         episodes: Number of all episodes behind a rate; None for a metric that is not a rate.
@@ -157,14 +156,9 @@ def difference(x: Estimate, y: Estimate) -> Estimate:
 
 
 def performance_profile(scores: Array, thresholds: Array) -> Estimate:
-    """Share of runs with a score above each threshold (run-score distribution of rliable).
+    """`[R, T]`, `[points]` -> `[points]` share of runs with a score above each threshold.
 
-    Args:
-        scores: `[R, T]`.
-        thresholds: `[points]`.
-
-    Returns:
-        `[points]`, with the exact interval of a share at each.
+    It is the run-score distribution of rliable, with the exact interval of each share.
     """
     there = scores[~np.isnan(scores)]
     above = np.mean(there[:, np.newaxis] > thresholds, axis=0)

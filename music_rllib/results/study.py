@@ -342,13 +342,10 @@ def _has(run: RunRecord, name: str, value: str) -> bool:
 def _equal_in_the_rest(
     first: Sequence[Condition], second: Sequence[Condition], hypothesis: Hypothesis
 ) -> Pairs | str:
-    """Pairs of conditions that differ only in the settings of a hypothesis.
+    """Pairs of conditions that differ only in a hypothesis's settings, or why there are none.
 
     A single condition on each side is a pair even if other settings differ: each q can have its own
     α.
-
-    Returns:
-        The pairs, or the reason why there are none.
     """
     for side, settings in ((first, hypothesis.first), (second, hypothesis.second)):
         if not side:

@@ -113,8 +113,6 @@ def reason_to_prune(
     over this and the earlier trials, because a few runs of one trial are a poor estimate of it.
 
     Args:
-        objective: The objective.
-        pruning: The settings.
         scores: The trial's scores so far, `[seeds, tasks]`.
         others: Trial number to the scores at this rung of each earlier trial that reached it.
         whole: Trial number to the final scores of each earlier complete trial; they give the

@@ -251,11 +251,7 @@ def check_database(url: str) -> None:
 
 @contextlib.contextmanager
 def _checked(url: str) -> Iterator[URL]:
-    """The parsed URL; errors of the database become errors that name the setting.
-
-    Raises:
-        StorageError: The URL has a password, or the database can't be used.
-    """
+    """The parsed URL; a password in it, or a database that can't be used, is a StorageError."""
     try:
         parsed = make_url(database_url(url if "://" in url else sqlite_url(Path(url).expanduser())))
         if parsed.password:

@@ -277,11 +277,7 @@ def _measure(console: Console, opened: OpenSweep) -> dict[str, Any]:
 
 
 def _stopped_early(console: Console, stopped: KeyboardInterrupt | SystemExit) -> int:
-    """The exit code for a signal that came while nothing was trained.
-
-    Raises:
-        SystemExit: The cause was not a signal.
-    """
+    """The exit code for a signal that came while nothing was trained; raises other causes."""
     if not is_stop(stopped):
         raise stopped
     by_ray = isinstance(stopped, SystemExit)

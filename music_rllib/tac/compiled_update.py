@@ -117,8 +117,6 @@ class CompiledUpdate:
             batch: K concatenated minibatches, as documented in `minibatches`.
             optimizer: Adam of the trained parameters. None: only compute gradients.
             done: number of updates before these.
-            entropic_index: q.
-            alpha: entropy coefficient.
             tuned: Adam of ln alpha, and measure and target of `alpha_loss_backward`. None:
                 alpha is fixed.
         """

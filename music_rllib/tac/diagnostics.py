@@ -155,9 +155,7 @@ def critic_bias(
     """Mean over episodes of the critics' value of the first step minus the realized return.
 
     Args:
-        fresh: the episodes.
         rewards: [S] with the intrinsic reward.
-        module: TAC's networks.
         objective: gives the entropy's part of the return, and the value after a truncation.
         noise: standard normal noise [S, A] for the policy's actions, by name.
     """

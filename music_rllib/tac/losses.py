@@ -26,9 +26,6 @@ class ScheduledSettings:
     """q, alpha and the weights of intrinsic rewards at the time of the last `advance`.
 
     Args:
-        tac: settings of TAC.
-        music: settings of MUSIC.
-        intrinsic: settings of another intrinsic reward.
         total_env_steps: the run's budget; 0 if it is unknown.
         actions: number of action dimensions.
     """

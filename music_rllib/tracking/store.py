@@ -229,11 +229,7 @@ def _get(store: TrackingStore, page: str) -> requests.Response:
 
 
 def _checked_scheme(uri: str) -> str:
-    """Scheme of a tracking URI.
-
-    Raises:
-        TrackingError: MLflow has no such scheme, or the URI has no host.
-    """
+    """Scheme of a tracking URI; a TrackingError if MLflow lacks it, or the URI has no host."""
     scheme = uri.partition("://")[0].partition("+")[0] if "://" in uri else ""
     if scheme not in (*_SERVERS, *_DATABASES):
         raise TrackingError(

@@ -49,12 +49,7 @@ VERSIONS = "versions.json"
 
 
 class RunStorage:
-    """Reads and writes the storage of one run.
-
-    Args:
-        job: The run.
-        note: Receives messages for the user.
-    """
+    """Reads and writes the storage of one run; `note` receives messages for the user."""
 
     def __init__(self, job: NodeJob, note: Callable[[str], None]) -> None:
         self._job, self._note = job, note

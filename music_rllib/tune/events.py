@@ -33,20 +33,12 @@ _COLOR = re.compile(r"\x1b\[[0-9;]*m")
 class TuneEvents(Callback):
     """Updates the scheduler when Tune's trials change, and passes the events to the listeners.
 
-    Tune calls it with keywords only.
+    The folder `failures` receives the tracebacks of failed runs. Tune calls it with keywords only.
     """
 
     def __init__(
         self, scheduler: Scheduler, store: NodeStore, listeners: Iterable[Listener], failures: Path
     ) -> None:
-        """Pass events of Tune to `listeners`.
-
-        Args:
-            scheduler: Has the nodes and their statuses.
-            store: Has the results of finished nodes.
-            listeners: Receive the events of runs.
-            failures: Folder for the tracebacks of failed runs.
-        """
         self._scheduler = scheduler
         self._store = store
         self._listeners = list(listeners)

@@ -122,15 +122,6 @@ class DagSearcher(Searcher):
         stopped: Callable[[], bool] = lambda: False,
         shared: SharedRuns | None = None,
     ) -> None:
-        """Suggest the nodes of `scheduler`.
-
-        Args:
-            scheduler: Has the nodes and their statuses.
-            config_of: Makes the Tune config of a node.
-            searches: Add nodes to the scheduler.
-            stopped: Returns whether the sweep was stopped.
-            shared: The runs of other processes.
-        """
         super().__init__()
         self._scheduler = scheduler
         self._config_of = config_of
@@ -191,11 +182,9 @@ def compute(
 
     Args:
         sweep: Afterwards, its scheduler has the status of each node.
-        listeners: Receive the events of runs.
         on_stop: Called, in a signal handler, when the user asks to stop.
         on_ray_gone: Called, in a thread, before the process ends because Ray has ended: with the
             cause, or None if the user's signal ended Ray too.
-        searches: The controller of the searches, if there are any.
         wait_minutes: Time to wait for a cluster's nodes, as in `cluster`.
 
     Returns:

@@ -98,11 +98,7 @@ def slurm(
 
 
 def _write(script: Path, header: list[str]) -> None:
-    """Write the script, unless it would replace a file of the user's.
-
-    Raises:
-        BadInputError: The file has another origin or cannot be written.
-    """
+    """Write the script; a file of another origin, or an unwritable one, is a BadInputError."""
     parts = ["#!/bin/sh", _MADE_BY, *header, BODY.read_text(encoding="utf-8")]
     try:
         if script.exists() and _MADE_BY not in script.read_text(encoding="utf-8"):
@@ -113,11 +109,7 @@ def _write(script: Path, header: list[str]) -> None:
 
 
 def _submit(arguments: list[str]) -> str:
-    """Number of the submitted job.
-
-    Raises:
-        BadInputError: There is no sbatch, or it refuses the job.
-    """
+    """Number of the submitted job; a BadInputError if there is no sbatch, or it refuses the job."""
     command = ["sbatch", "--parsable", *arguments]
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603

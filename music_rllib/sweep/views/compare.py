@@ -27,7 +27,6 @@ def compare_stage(
     """The comparison of a stage's conditions as plain data, and as text with tables.
 
     Args:
-        location: The sweep.
         stage: Name of the stage; None: the stage of the analysis, or the last one.
         metric: The compared metric; None: the objective's, or the primary one of each task.
         minimize: Lower values of the metric are better.
