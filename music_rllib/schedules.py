@@ -197,7 +197,7 @@ AdaptiveSchedule = Annotated[
 
 
 def value_at(
-    schedule: float | Linear | Piecewise | Measured,
+    schedule: AdaptiveSchedule,
     env_steps: int,
     total_env_steps: int,
     measured: float | None = None,
@@ -245,7 +245,7 @@ def _between(value: float, one: float, other: float) -> float:
     return min(max(value, min(one, other)), max(one, other))
 
 
-def extremes(schedule: float | Linear | Piecewise | Measured) -> tuple[float, float]:
+def extremes(schedule: AdaptiveSchedule) -> tuple[float, float]:
     """Smallest and largest value the schedule ever takes."""
     match schedule:
         case Linear():
@@ -280,9 +280,7 @@ def check_measurable(settings: Mapping[str, object], *, success: bool, entropy: 
 def bounded(rule: str, holds: Callable[[float], bool]) -> AfterValidator:
     """A pydantic validator that `holds` for a schedule's smallest and largest value."""
 
-    def check(
-        schedule: float | Linear | Piecewise | Measured,
-    ) -> float | Linear | Piecewise | Measured:
+    def check(schedule: AdaptiveSchedule) -> AdaptiveSchedule:
         for value in extremes(schedule):
             if not holds(value):
                 raise ValueError(f"must be {rule}, got {value:g}")

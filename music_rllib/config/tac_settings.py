@@ -338,9 +338,7 @@ class TACSettings(StrictModel):
         return self
 
 
-def setting_text(
-    value: float | Linear | Piecewise | Measured | LearnedAlpha | MatchedAlpha | NormalisedAlpha,
-) -> str:
+def setting_text(value: AdaptiveSchedule | Alpha) -> str:
     """Short text for a constant, a schedule or a coefficient: `1.5`, `1 to 2`, `learned`."""
     match value:
         case MatchedAlpha():

@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from music_rllib.limits import MOST_INDICES
+from music_rllib.schedules import StrictModel
 
 if TYPE_CHECKING:
     from music_rllib.replay.trajectories import ReplayLayout, Transitions
@@ -70,9 +71,7 @@ def check_split(agent_indices: Sequence[int], surrounding_indices: Sequence[int]
 Symmetry = Literal["mirror", "translate"]
 
 
-class _Entries(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
+class _Entries(StrictModel):
     positions: Indices = ()
     """Entries of the observation that are positions in one direction, such as every y."""
     goal: Indices = ()

@@ -30,8 +30,6 @@ from types import MappingProxyType
 from typing import Annotated, Any, Self
 
 from pydantic import (
-    BaseModel,
-    ConfigDict,
     Field,
     JsonValue,
     field_validator,
@@ -40,16 +38,15 @@ from pydantic import (
 
 from music_rllib import names
 from music_rllib.envs.features import Indices, Mirror, Symmetries, Translation, check_split
+from music_rllib.schedules import StrictModel
 
 LAST_SEED = 2**31 - 1
 """Largest seed of a reset: environments often keep it in a signed 32-bit integer."""
 Seed = Annotated[int, Field(ge=0, le=LAST_SEED)]
 
 
-class Task(BaseModel):
+class Task(StrictModel):
     """One environment as experiments see it."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=80)
     """Name in sweeps, labels and reports. Does not influence results."""
@@ -158,19 +155,6 @@ def _fetch(name: str, *, split: bool = True, mi_reward_weight: float = 1.0) -> T
     )
 
 
-def _hand(name: str) -> Task:
-    # Observation: 24 joint angles, their 24 velocities, the object's 6 velocities and its pose. The
-    # split uses only the position, so that distances of surrounding states are in meters.
-    return Task(
-        name=name,
-        env_id=f"{name}-v1",
-        horizon=100,
-        agent_indices=tuple(range(24)),
-        surrounding_indices=(54, 55, 56),
-        reward_range=_SPARSE,
-    )
-
-
 BUILT_IN_TASKS: Mapping[str, Task] = MappingProxyType(
     {
         task.name: task
@@ -181,7 +165,17 @@ BUILT_IN_TASKS: Mapping[str, Task] = MappingProxyType(
             _fetch("FetchPickAndPlace"),
             # The original MUSIC halves the weight on Slide.
             _fetch("FetchSlide", mi_reward_weight=0.5),
-            _hand("HandManipulateBlock"),
+            # Observation: 24 joint angles, their 24 velocities, the object's 6 velocities and its
+            # pose. The split uses only the position, so that distances of surrounding states are in
+            # meters.
+            Task(
+                name="HandManipulateBlock",
+                env_id="HandManipulateBlock-v1",
+                horizon=100,
+                agent_indices=tuple(range(24)),
+                surrounding_indices=(54, 55, 56),
+                reward_range=_SPARSE,
+            ),
             Task(
                 name="PointCarry",
                 env_id="music_rllib.envs.point_carry:PointCarry-v0",

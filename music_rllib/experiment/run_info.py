@@ -10,6 +10,7 @@ from typing import Any
 from music_rllib import names
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.tac_settings import (
+    Alpha,
     LearnedAlpha,
     MatchedAlpha,
     NormalisedAlpha,
@@ -17,7 +18,7 @@ from music_rllib.config.tac_settings import (
 )
 from music_rllib.envs.fingerprint import Fingerprint, digest_of
 from music_rllib.experiment.plan import Node, short
-from music_rllib.schedules import Linear, Measured, Piecewise, value_at
+from music_rllib.schedules import AdaptiveSchedule, value_at
 from music_rllib.store.serialization import content_key
 from music_rllib.version import ALGORITHM_VERSION
 
@@ -88,10 +89,7 @@ def run_info(node: Node, environment: Fingerprint | None = None) -> RunInfo:
     )
 
 
-def _at_start(
-    value: float | Linear | Piecewise | Measured | LearnedAlpha | MatchedAlpha | NormalisedAlpha,
-    run: RunSettings,
-) -> float:
+def _at_start(value: AdaptiveSchedule | Alpha, run: RunSettings) -> float:
     """The value of a setting at environment step 0."""
     if isinstance(value, LearnedAlpha):
         return value.initial

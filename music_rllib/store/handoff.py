@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from music_rllib.envs.tasks import Task
 from music_rllib.errors import BadInputError, reason_of
@@ -26,6 +26,7 @@ from music_rllib.limits import (
     read_json,
     read_regular,
 )
+from music_rllib.schedules import StrictModel
 from music_rllib.store.serialization import arrays_from_bytes, arrays_to_bytes, content_key
 from music_rllib.store.storage import write_atomically
 from music_rllib.version import ALGORITHM_VERSION
@@ -43,11 +44,7 @@ class HandoffError(BadInputError, ValueError):
     """A handoff is missing, damaged or does not fit; the message says which and why."""
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class Architecture(_Strict):
+class Architecture(StrictModel):
     """The settings that determine the shapes and the meaning of network weights."""
 
     hidden_sizes: tuple[int, ...]
@@ -82,7 +79,7 @@ class Architecture(_Strict):
         return [f"tac.{name}" for name in fields if getattr(self, name) != getattr(other, name)]
 
 
-class Spaces(_Strict):
+class Spaces(StrictModel):
     """The sizes and bounds of an environment's spaces that a policy needs to act."""
 
     observation_size: int = Field(gt=0)
@@ -109,7 +106,7 @@ class Spaces(_Strict):
         )
 
 
-class HandoffInfo(_Strict):
+class HandoffInfo(StrictModel):
     """The run that a handoff comes from."""
 
     task: Task
@@ -124,12 +121,12 @@ class HandoffInfo(_Strict):
     max_episode_steps: int | None
 
 
-class _Array(_Strict):
+class _Array(StrictModel):
     shape: tuple[int, ...]
     dtype: str
 
 
-class _ModuleFile(_Strict):
+class _ModuleFile(StrictModel):
     file: Annotated[str, Field(pattern=r"^[a-z_]+\.safetensors$")]
     """Name in the manifest's folder; a forged manifest cannot name another place."""
     sha256: str
@@ -137,7 +134,7 @@ class _ModuleFile(_Strict):
     arrays: dict[str, _Array]
 
 
-class HandoffManifest(_Strict):
+class HandoffManifest(StrictModel):
     """Content of `handoff.json`."""
 
     format: Literal["music_rllib handoff 1"] = "music_rllib handoff 1"

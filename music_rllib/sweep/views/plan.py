@@ -23,7 +23,7 @@ from music_rllib.experiment.open_sweep import OpenSweep, plan_node
 from music_rllib.experiment.plan import Node, Plan, remarks, short
 from music_rllib.names import in_runs
 from music_rllib.redaction import redact
-from music_rllib.schedules import Linear, Measured, Piecewise, value_at
+from music_rllib.schedules import AdaptiveSchedule, Measured, value_at
 
 if TYPE_CHECKING:
     from music_rllib.runtime.ray_cluster import Capacity
@@ -256,7 +256,7 @@ def _alpha_row(node: Node, action_dimensions: int) -> dict[str, Any]:
     }
 
 
-def _final_q(q: float | Linear | Piecewise | Measured, budget: int) -> float:
+def _final_q(q: AdaptiveSchedule, budget: int) -> float:
     """The q at the end of a run; one that follows a measurement ends at its last point."""
     if isinstance(q, Measured):
         return q.points[-1 if q.follows == "success_rate" else 0][1]
