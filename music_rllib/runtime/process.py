@@ -16,6 +16,12 @@ from typing import Any, NoReturn
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
+def handle_signals(handler: Callable[[int, FrameType | None], object]) -> None:
+    """Call `handler` for Ctrl-C and SIGTERM."""
+    for number in SIGNALS:
+        signal.signal(number, handler)
+
+
 class EarlySignals:
     """Handle Ctrl-C and SIGTERM while a sweep is being set up.
 
@@ -42,8 +48,7 @@ class EarlySignals:
     def install(self) -> None:
         """Set the handlers, also after a library has replaced them."""
         if self._before:
-            for number in SIGNALS:
-                signal.signal(number, self._handle)
+            handle_signals(self._handle)
 
     def check(self) -> None:
         """Raise KeyboardInterrupt if a signal was received."""

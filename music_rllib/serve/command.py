@@ -6,11 +6,10 @@ import contextlib
 import logging
 import os
 import re
-import signal
 import socket
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from ipaddress import ip_address
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,7 +18,7 @@ import typer
 from music_rllib.errors import BadInputError
 from music_rllib.redaction import redact
 from music_rllib.runtime.machine import check_reachable, cluster_address
-from music_rllib.runtime.process import SIGNALS
+from music_rllib.runtime.process import handle_signals
 from music_rllib.serve import TOKEN_VARIABLE
 
 if TYPE_CHECKING:
@@ -95,22 +94,17 @@ def serve(
     served = policy_of(settings)
     if cluster is None:
         _check_replicas(settings, [cpus_here()])
-    _on_signals(_interrupt)
+    handle_signals(_interrupt)
     with contextlib.suppress(KeyboardInterrupt):
         start_ray(num_cpus=None if cluster else cpus_here())
         try:
-            _on_signals(_interrupt)  # Ray's own handler of SIGTERM would end the process at once
+            handle_signals(_interrupt)  # Ray's own handler of SIGTERM would end the process at once
             if cluster is not None:
                 _check_cluster(settings)
             _serve(application(served, settings), settings, host, port)
         finally:
             stop_ray()
     return 0
-
-
-def _on_signals(handler: Callable[..., None]) -> None:
-    for number in SIGNALS:
-        signal.signal(number, handler)
 
 
 def _interrupt(*_: object) -> None:
@@ -193,7 +187,7 @@ def _serve(app: Application, settings: ServeSettings, host: str, port: int) -> N
         ray_serve.run(app, name="policy", route_prefix="/", logging_config=QUIET)
         url = f"http://{f'[{host}]' if ':' in host else host}:{port}"
         stop = threading.Event()
-        _on_signals(lambda *_: stop.set())
+        handle_signals(lambda *_: stop.set())
         print(f"Serving {redact(settings.policy)} at {url}", flush=True)
         print(f"POST /act, GET /health, GET /policy; described at {url}/openapi.json", flush=True)
         watch = RayWatch()

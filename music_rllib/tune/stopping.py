@@ -16,7 +16,7 @@ from ray.tune.experiment import Trial
 
 from music_rllib.command_line import say_stopped_at_once
 from music_rllib.errors import FAILED
-from music_rllib.runtime.process import SIGNALS, early, end_process
+from music_rllib.runtime.process import SIGNALS, early, end_process, handle_signals
 from music_rllib.runtime.ray_cluster import RayWatch
 from music_rllib.training.job import StopFlag
 from music_rllib.training.worker import STOPPED
@@ -74,8 +74,7 @@ class StopSignals(tune.Callback):
             early.install()
             early.check()
             self._handlers_before = {number: signal.getsignal(number) for number in SIGNALS}
-            for number in SIGNALS:
-                signal.signal(number, self._stop)
+            handle_signals(self._stop)
         threading.Thread(target=self._watch_ray, name="ray-watch", daemon=True).start()
 
     def __exit__(self, *_: object) -> None:
@@ -97,12 +96,10 @@ class StopSignals(tune.Callback):
         def end_loop() -> None:
             if callable(tunes_handler):
                 tunes_handler(signal.SIGINT, None)
-            for number in SIGNALS:  # Tune has restored the earlier ones
-                signal.signal(number, self._stop_at_once)
+            handle_signals(self._stop_at_once)  # Tune has restored the earlier ones
 
         self._end_loop = end_loop
-        for number in SIGNALS:
-            signal.signal(number, self._stop)
+        handle_signals(self._stop)
         if early.received is not None:
             self._stop(early.received, None)
 
@@ -130,8 +127,7 @@ class StopSignals(tune.Callback):
 
     def _stop(self, number: int, frame: FrameType | None) -> None:
         self.received, self._asked_at = number, time.monotonic()
-        for each in SIGNALS:
-            signal.signal(each, self._stop_at_once)
+        handle_signals(self._stop_at_once)
         # In a thread: the main thread may be in a call of Ray.
         threading.Thread(target=self._tell_workers, daemon=True).start()
         self._on_stop()
