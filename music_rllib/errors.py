@@ -2,6 +2,7 @@
 
 import re
 import signal
+from collections.abc import Sequence
 
 FAILED, BAD_INPUT = 1, 2
 _COLORS = re.compile(r"\x1b\[[0-9;]*m")
@@ -41,6 +42,12 @@ def reason_of(error: Exception) -> str:
 def shorten(text: str, limit: int = 300) -> str:
     """Cut a text to `limit` characters, ending with dots."""
     return text if len(text) <= limit else text[: limit - 3] + "..."
+
+
+def indented(lines: Sequence[str], shown: int = 10) -> list[str]:
+    """The first `shown` lines, indented, and the number of others."""
+    more = [f"  ... and {len(lines) - shown} more"] if len(lines) > shown else []
+    return [f"  {line}" for line in lines[:shown]] + more
 
 
 def is_stop(error: BaseException | None) -> bool:

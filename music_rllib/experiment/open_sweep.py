@@ -11,7 +11,7 @@ from typing import Any
 
 from music_rllib.config.schema import SweepConfig
 from music_rllib.envs.fingerprint import Fingerprint, differences, digest_of
-from music_rllib.errors import BadInputError
+from music_rllib.errors import BadInputError, indented
 from music_rllib.experiment.plan import Node, Plan, budget_settings, continuation_key, make_plan
 from music_rllib.experiment.scheduler import DONE, Scheduler
 from music_rllib.experiment.sweep_files import PLAN, SweepLocation, as_json, read_json
@@ -322,8 +322,7 @@ def changed_text(sweep: OpenSweep, runs: Iterable[FoundRun]) -> str | None:
             f"the environment of {task} has changed since {in_runs(len(members))} used it: "
             f"{', '.join(changes[:SHOWN])}{more}"
         )
-        lines += [f"  {sweep.short(run.label)}: {run.progress}" for run in members[:SHOWN]]
-        lines += [f"  ... and {len(members) - SHOWN} more"] * (len(members) > SHOWN)
+        lines += indented([f"{sweep.short(run.label)}: {run.progress}" for run in members], SHOWN)
     return "\n".join((*lines, f"Choose: {ADVICE}.")) if lines else None
 
 

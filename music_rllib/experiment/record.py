@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.schema import Stage, SweepConfig
-from music_rllib.errors import BadInputError
+from music_rllib.errors import BadInputError, indented
 from music_rllib.experiment.open_sweep import FINISHED, OpenSweep, plan_node
 from music_rllib.experiment.plan import Node, budget_settings, make_plan
 from music_rllib.experiment.sweep_files import (
@@ -29,10 +29,6 @@ from music_rllib.names import in_runs
 from music_rllib.redaction import redact, without_secrets
 from music_rllib.store.node_store import NodeStore
 from music_rllib.store.storage import StorageError, database_url
-
-SHOWN = 10
-"""Lines of each list that are shown."""
-
 
 # Writing the record -------------------------------------------------------------------------------
 
@@ -139,18 +135,13 @@ class Changes(NamedTuple):
         return "\n".join(
             (
                 f"the configuration of sweep {self.name!r} has changed since it was last run:",
-                *_indented(self.differences),
+                *indented(self.differences),
                 f"{in_runs(len(self.lost))} would be retrained without using {have}:",
-                *_indented(self.lost),
+                *indented(self.lost),
                 "Choose: --accept-changes does that (the old results stay in the storage), "
                 "--name NEW keeps both sweeps, the old configuration uses the existing results.",
             )
         )
-
-
-def _indented(lines: tuple[str, ...]) -> list[str]:
-    more = [f"  ... and {len(lines) - SHOWN} more"] if len(lines) > SHOWN else []
-    return [f"  {line}" for line in lines[:SHOWN]] + more
 
 
 def changes_since(sweep: OpenSweep) -> Changes | None:

@@ -27,6 +27,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 from music_rllib.envs.fingerprint import Fingerprint
+from music_rllib.errors import indented
 from music_rllib.store.history import HISTORY, Report, RunResult, from_json_lines, last_values
 from music_rllib.store.sealed import MANIFEST, Manifest, SealedFolders
 from music_rllib.store.storage import DamagedError, open_storage, write_atomically
@@ -36,8 +37,6 @@ K = TypeVar("K")
 V = TypeVar("V")
 FEW = 64
 """Number of nodes up to which a request for each is cheaper than a list of all files."""
-SHOWN = 10
-"""Number of damaged runs that a message names."""
 SETTLED_SECONDS = 2.0
 """A file that is newer may be written again without a change of its time stamp."""
 CONTINUATIONS, VERIFIED = "continuations", "verified.json"
@@ -248,8 +247,6 @@ def _as_text(metrics: Mapping[str, float]) -> dict[str, str]:
 
 def damage_in_words(damage: Mapping[str, DamagedError]) -> str:
     """A message with the labels of damaged runs, their errors, and the remedy."""
-    lines = [f"  {label}: {error}" for label, error in list(damage.items())[:SHOWN]]
-    if len(damage) > SHOWN:
-        lines.append(f"  ... and {len(damage) - SHOWN} more")
+    lines = indented([f"{label}: {error}" for label, error in damage.items()])
     what = "1 finished run is" if len(damage) == 1 else f"{len(damage)} finished runs are"
     return "\n".join((f"{what} damaged; {TRAIN_AGAIN}:", *lines))
