@@ -111,6 +111,13 @@ class Plan:
         """All nodes, every one after its input."""
         return list(self._nodes.values())
 
+    def chain(self, key: str) -> list[Node]:
+        """The node of a run, after the planned nodes that it starts from."""
+        nodes = [self.node(key)]
+        while (source := nodes[0].input) is not None and source.checkpoint is None:
+            nodes.insert(0, self.node(source.key))
+        return nodes
+
     @property
     def searched(self) -> tuple[Stage, ...]:
         return tuple(stage for stage in self._stages.values() if stage.search is not None)

@@ -160,7 +160,7 @@ class SearchController(Listener):
                 for run in runs if trial.state is TrialState.COMPLETE else ():
                     if run.key in self._removed and not self._scheduler.knows(run.key):
                         self._request(run, None)  # the trial keeps its score
-                for node in (node for run in runs for node in self._nodes_of(run)):
+                for node in (node for run in runs for node in self._plan.chain(run.key)):
                     if not self._scheduler.knows(node.key):
                         finished = self._store.is_finished(node.key)
                         self._scheduler.add_pruned(node, finished=finished)
@@ -184,16 +184,9 @@ class SearchController(Listener):
         part = f"{phase}{trial.number}"
         return self._plan.add_trial(search.stage.name, number, study.point(trial), seeds, part)
 
-    def _nodes_of(self, run: Node) -> list[Node]:
-        """The node of a run, after the planned nodes that it starts from."""
-        nodes = [self._plan.node(run.key)]
-        while (source := nodes[0].input) is not None and source.checkpoint is None:
-            nodes.insert(0, self._plan.node(source.key))
-        return nodes
-
     def _request(self, run: Node, until: int | None) -> None:
         """Ask for a run up to an environment step; None: to its end."""
-        for node in self._nodes_of(run):
+        for node in self._plan.chain(run.key):
             new = not self._scheduler.knows(node.key)
             # A damaged node, or one of another environment, goes to a worker, which reports it.
             finished = new and self._store.is_sound(node.key) and self._is_current(node)

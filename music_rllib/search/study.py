@@ -62,15 +62,21 @@ class OptunaStudy:
         compared: Mapping[str, Any],
         alone: bool,
     ) -> None:
-        """Open the study as in `find_or_create`.
+        """Open the study, which is created if it does not exist.
 
-        `alone` says that no other driver is running now: running trials belong to a dead one.
+        Args:
+            storage: The studies' storage.
+            base: Beginning of the names of the search's studies, `sweep/stage`.
+            settings: Settings of the search.
+            determined_by: Plain data of everything else that determines the study's values.
+            compared: The compared values of the study; empty in `search` mode.
+            alone: Whether no other driver is running now: running trials belong to a dead one.
         """
         self.settings = settings
         self.compared = dict(compared)
         self._storage = storage
         self._me = f"{socket.gethostname()}:{os.getpid()}:{uuid.uuid4().hex[:8]}"
-        self._id, self.name = find_or_create(storage, base, settings, determined_by, compared)
+        self._id, self.name = self._find_or_create(base, determined_by)
         attributes = storage.get_study_user_attrs(self._id)
         self._proposer = Proposer(settings, attributes[POINTS])
         self._last_heartbeat = 0.0
@@ -86,6 +92,35 @@ class OptunaStudy:
         self._seen: dict[str, tuple[float, float]] = {}
         """Last heartbeat of each other driver, and the monotonic time when it was first seen."""
         self.release_the_dead(alone=alone)
+
+    def _find_or_create(self, base: str, determined_by: Mapping[str, Any]) -> tuple[int, str]:
+        """The id and the name of the study."""
+        storage, settings = self._storage, self.settings
+        # Neither the number of trials nor the storage determines points and values.
+        excluded = {"trials", "final", "study", "storage", "compare", "mode"}
+        own = settings.model_dump(mode="json", by_alias=True, exclude=excluded)
+        values = (f"{name}={short(value, name)}" for name, value in self.compared.items())
+        base = "/".join((base, *values))
+        name = f"{base} @{content_key([own, {**determined_by, 'arm': self.compared}])}"
+
+        try:
+            study = storage.get_study_id_from_name(name)
+        except KeyError:
+            points = _first_points(storage, settings, base)  # before another driver sees the study
+            try:
+                study = storage.create_new_study(directions_of(settings), study_name=name)
+            except DuplicatedStudyError:
+                study = storage.get_study_id_from_name(name)
+            else:
+                storage.set_study_user_attr(study, POINTS, points)
+                return study, name
+        patience = time.monotonic() + CREATION_SECONDS
+        while POINTS not in storage.get_study_user_attrs(study):
+            if time.monotonic() > patience:  # its creator died before any search used it
+                points = _first_points(storage, settings, base)
+                storage.set_study_user_attr(study, POINTS, points)
+            time.sleep(0.1)
+        return study, name
 
     # -- reading -----------------------------------------------------------------------------
 
@@ -275,48 +310,6 @@ def _has_ended(owner: str) -> bool:
 
 
 # Creating a study --------------------------------------------------------------------------------
-
-
-def find_or_create(
-    storage: BaseStorage,
-    base: str,
-    settings: SearchSettings,
-    determined_by: Mapping[str, Any],
-    compared: Mapping[str, Any],
-) -> tuple[int, str]:
-    """The id and the name of a study, which is created if it does not exist.
-
-    Args:
-        storage: The studies' storage.
-        base: Beginning of the names of the search's studies, `sweep/stage`.
-        settings: Settings of the search.
-        determined_by: Plain data of everything else that determines the study's values.
-        compared: The compared values of the study; empty in `search` mode.
-    """
-    # Neither the number of trials nor the storage determines points and values.
-    excluded = {"trials", "final", "study", "storage", "compare", "mode"}
-    own = settings.model_dump(mode="json", by_alias=True, exclude=excluded)
-    base = "/".join((base, *(f"{name}={short(value, name)}" for name, value in compared.items())))
-    name = f"{base} @{content_key([own, {**determined_by, 'arm': dict(compared)}])}"
-
-    try:
-        study = storage.get_study_id_from_name(name)
-    except KeyError:
-        points = _first_points(storage, settings, base)  # before another driver sees the study
-        try:
-            study = storage.create_new_study(directions_of(settings), study_name=name)
-        except DuplicatedStudyError:
-            study = storage.get_study_id_from_name(name)
-        else:
-            storage.set_study_user_attr(study, POINTS, points)
-            return study, name
-    patience = time.monotonic() + CREATION_SECONDS
-    while POINTS not in storage.get_study_user_attrs(study):
-        if time.monotonic() > patience:  # its creator died before any search used it
-            points = _first_points(storage, settings, base)
-            storage.set_study_user_attr(study, POINTS, points)
-        time.sleep(0.1)
-    return study, name
 
 
 def fits(values: Mapping[str, Any], settings: SearchSettings) -> bool:

@@ -190,9 +190,7 @@ def sweep_of_run(sweep: OpenSweep, key: str, folder: Path) -> dict[str, Any]:
 
     A handoff from outside that it starts from is copied from a bucket into `folder`.
     """
-    chain = [sweep.plan.node(key)]
-    while (given := chain[0].input) is not None and given.checkpoint is None:
-        chain.insert(0, sweep.plan.node(given.key))
+    chain = sweep.plan.chain(key)
     tasks = {node.run.task.name: node.run.task for node in chain}
     environments = {
         name: task.model_dump(mode="json", exclude={"name"})
@@ -215,15 +213,14 @@ def _stage(sweep: OpenSweep, node: Node, folder: Path) -> dict[str, Any]:
     for dotted in VARIANTS[run.variant].without_effect:
         group, _, name = dotted.partition(".")
         settings[group].pop(name)
-    source: dict[str, Any] = {}
-    if (given := node.input) is not None and given.checkpoint is None:
+    header = {"name": node.stage, "variant": run.variant, "tasks": [run.task.name]}
+    if (given := node.input) is None:
+        return header | settings
+    if given.checkpoint is None:
         place = {"stage": sweep.plan.node(given.key).stage}
-        source = {"init_from": place | {"task": given.task.name}}
-    elif given is not None:
+    else:
         checkpoint = sweep.store.lasting_files(given.key)
         if is_remote(sweep.storage):  # `checkpoint` is a temporary copy
             checkpoint = shutil.copytree(checkpoint, folder / "source", dirs_exist_ok=True)
         place = {"checkpoint": str(checkpoint.absolute())}
-        source = {"init_from": place | {"task": given.task.name}}
-    header = {"name": node.stage, "variant": run.variant, "tasks": [run.task.name]}
-    return header | source | settings
+    return header | {"init_from": place | {"task": given.task.name}} | settings
