@@ -45,13 +45,10 @@ class FlatParameters:
 
     def views(self, flat: Tensor) -> list[Tensor]:
         """Parts of a tensor [S], one for each parameter, in its shape."""
-        return [self._view(flat, parameter) for parameter in self.parameters]
+        return [self.view(flat, parameter) for parameter in self.parameters]
 
-    def gradient(self, parameter: Tensor) -> Tensor:
-        """The part of `gradients` that belongs to a parameter."""
-        return self._view(self.gradients, parameter)
-
-    def _view(self, flat: Tensor, parameter: Tensor) -> Tensor:
+    def view(self, flat: Tensor, parameter: Tensor) -> Tensor:
+        """The part of a tensor [S] that belongs to a parameter, in its shape."""
         start = self.start(parameter)
         return flat[start : start + parameter.numel()].view(parameter.shape)
 

@@ -262,18 +262,12 @@ class LeaseFile:
 
 
 class HeldLease:
-    """A lease that was just acquired in `file`, which a thread renews until it is released.
+    """A lease that was just acquired in `file`, which a thread renews until it is released."""
 
-    The thread calls `on_lost` when it finds that another process has taken the lease.
-    """
-
-    def __init__(
-        self, file: LeaseFile, lease: Lease, on_lost: Callable[[], None] = lambda: None
-    ) -> None:
+    def __init__(self, file: LeaseFile, lease: Lease) -> None:
         self._file, self._lease = file, lease
         self._duration = lease.expires - lease.since
         self._ended = threading.Event()
-        self._on_lost = on_lost
         self.lost = False
         """Whether another process is known to have the lease."""
         self._thread = threading.Thread(target=self._renew, name="lease", daemon=True)
@@ -316,7 +310,6 @@ class HeldLease:
             with contextlib.suppress(OSError, StorageError):
                 if not self._file.renew(later):
                     self.lost = True
-                    self._on_lost()
                     return
 
     def _wait_until_due(self) -> bool:

@@ -144,11 +144,12 @@ class TAC(Algorithm):
         self.replay.extend(
             episodes, self._trajectory_priorities(episodes), self._values_to_store(episodes)
         )
+        schedule, budget = self._settings.replay.importance_exponent, self.config.total_env_steps
+        exponent = value_at(schedule, self.env_steps, budget or 0)
         for updates in self._updates_due():
             with self.metrics.log_time((TIMERS, REPLAY_BUFFER_SAMPLE_TIMER)):
                 drawn = self.replay.sample_transitions(
-                    updates * self._settings.tac.batch_size,
-                    importance_exponent=self._importance_exponent,
+                    updates * self._settings.tac.batch_size, importance_exponent=exponent
                 )
                 batch = batch_of(
                     drawn, self._sample_trajectories(updates), self.replay.values_of(drawn.rows)
@@ -291,11 +292,6 @@ class TAC(Algorithm):
         due = int(counted_steps * self._settings.tac.replay_ratio) - self.grad_updates
         full, rest = divmod(max(due, 0), UPDATES_PER_CALL)
         return [UPDATES_PER_CALL] * full + ([rest] if rest else [])
-
-    @property
-    def _importance_exponent(self) -> float:
-        schedule, budget = self._settings.replay.importance_exponent, self.config.total_env_steps
-        return value_at(schedule, self.env_steps, budget or 0)
 
     def _sample_trajectories(self, updates: int) -> dict[str, WholeTrajectories]:
         """The trajectories of the estimator and of another intrinsic reward, if they need some."""

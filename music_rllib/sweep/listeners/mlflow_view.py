@@ -13,15 +13,10 @@ from typing import Any
 from music_rllib import names
 from music_rllib.config.schema import Stage
 from music_rllib.experiment.plan import Plan
+from music_rllib.results.conditions import IN_WORDS
 
 VERSIONS = ("3.17", "3.18")
 """Versions of MLflow whose pages open such a view; others get a plain link."""
-GROUPED = {
-    "tac.entropic_index": names.TAG_ENTROPIC_INDEX,
-    "tac.alpha": names.TAG_ALPHA,
-    "music.mi_reward_weight": names.TAG_MI_REWARD_WEIGHT,
-}
-"""Setting to the tag that holds its value."""
 METRICS = (names.EVAL_RETURN, names.SHANNON_ENTROPY, names.ENTROPY, names.MI_BOUND)
 """Charts after those of the tasks' primary metrics."""
 SECTION = "comparison"
@@ -38,7 +33,8 @@ def comparison_view(plan: Plan, stage: Stage, sweep_id: str, now: float) -> str:
     varied = {name for node in plan.nodes if node.stage == stage.name for name in node.values}
     if stage.search is not None:  # none of its trials is planned yet
         varied |= {*stage.search.space, *stage.search.compare}
-    tags = [names.TAG_ENTROPIC_INDEX, *(tag for name, tag in GROUPED.items() if name in varied)]
+    tags = [names.TAG_ENTROPIC_INDEX]
+    tags += [tag for name, (_, tag) in IN_WORDS.items() if name in varied]
     tags += [names.TAG_TASK] if len(tasks) > 1 else []
     state = {
         "searchFilter": f"tags.sweep_id = '{sweep_id}' and tags.{names.TAG_CURRENT} = "

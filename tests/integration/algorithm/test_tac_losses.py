@@ -19,7 +19,9 @@ from music_rllib.tac.learner import TACLearner
 OBSERVATION, ACTION, BATCH = 6, 3, 32
 
 
-def small_learner(observations: gym.Space, actions: int, seed: int, **settings: Any) -> TACLearner:
+def small_learner(
+    observations: gym.spaces.Box, actions: int, seed: int, **settings: Any
+) -> TACLearner:
     """A learner with small networks for `actions` dimensions of actions."""
     spaces = (observations, gym.spaces.Box(-1.0, 1.0, (actions,)))
     config = TACConfig().debugging(seed=seed)

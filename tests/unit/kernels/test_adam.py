@@ -43,7 +43,7 @@ def test_compiled_and_plain_steps_continue_each_other(steps_before: int) -> None
             flat = flat or FlatParameters(ours)
             for b in ours:
                 assert b.grad is not None
-                flat.gradient(b).copy_(b.grad)
+                flat.view(flat.gradients, b).copy_(b.grad)
             adam_step(fused.step_of(flat))
         else:
             fused.step()

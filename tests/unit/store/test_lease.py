@@ -19,6 +19,7 @@ import pytest
 from music_rllib.store import lease as lease_module
 from music_rllib.store.lease import HeldLease, Lease, LeaseFile, LeaseLostError, runs_here
 from music_rllib.store.storage import StorageError, StorageFolder, open_storage
+from tests.processes import wait_until
 
 pytestmark = pytest.mark.faults
 
@@ -202,11 +203,9 @@ def test_an_owner_that_lost_its_lease_leaves_no_folder(tmp_path: Path) -> None:
     path = tmp_path / "work" / "key" / "lease.json"
     file, mine = lease_file(path), Lease.of_this_process("m", 0.4)
     assert file.acquire(mine) is None
-    told = threading.Event()
-    held = HeldLease(file, mine, told.set)
+    held = HeldLease(file, mine)
     shutil.rmtree(path.parent)
-    assert told.wait(30)
-    assert held.lost
+    wait_until(lambda: held.lost, 30)
     with pytest.raises(LeaseLostError, match="it names nobody"):
         held.check()
     assert not file.renew(mine)
