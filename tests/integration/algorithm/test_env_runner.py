@@ -325,10 +325,10 @@ def test_episodes_with_colored_noise_are_samples_of_the_policy_with_random_actio
 @pytest.mark.parametrize(
     ("space", "message"),
     [
-        (gym.spaces.Discrete(3), "bounded one-dimensional Box of floats, got Discrete"),
+        (gym.spaces.Discrete(3), "bounded one-dimensional Box of one or more floats, got Discrete"),
         (gym.spaces.Box(-np.inf, np.inf, (2,)), "must be a bounded one-dimensional Box"),
         # A policy's actions between -1 and 1 would all be truncated to 0.
-        (gym.spaces.Box(-1, 1, (2,), np.int32), "of floats, got Box"),
+        (gym.spaces.Box(-1, 1, (2,), np.int32), "of one or more floats, got Box"),
     ],
 )
 def test_unusable_action_spaces_are_named(space: Any, message: str) -> None:
