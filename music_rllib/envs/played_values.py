@@ -5,9 +5,6 @@ Shape legend: n steps of an episode, O observation features, G goal features, N 
 
 from __future__ import annotations
 
-import contextlib
-import random
-from collections.abc import Iterator
 from typing import Any
 
 import gymnasium as gym
@@ -15,58 +12,13 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from music_rllib.envs.episodes import TOLERANCE
 from music_rllib.envs.values import GOAL_KEYS
-
-Numbers = NDArray[np.float64]
 
 _LOST = 0.05
 """Share of the range of some numbers from which on their rounding to float32 is reported."""
-_ROUNDING = 1e-5
-"""Relative difference of a reward from its range that counts as rounding."""
 _FEWEST_EPISODES = 3
 """Number of episodes with different goals that show what an observation contains."""
-
-
-class Beside(gym.Wrapper[Any, Any, Any, Any]):
-    """An environment; each of its steps follows one of a second environment.
-
-    Args:
-        env: the environment.
-        second: the other one.
-        seed: seed of the second environment's episodes.
-        generators: whether they share the global random generators of NumPy and Python.
-    """
-
-    def __init__(
-        self, env: gym.Env[Any, Any], second: gym.Env[Any, Any], seed: int, *, generators: bool
-    ) -> None:
-        super().__init__(env)
-        self._second, self._seed = second, seed
-        self._between = contextlib.nullcontext if generators else _kept_generators
-
-    def reset(self, **options: Any) -> Any:
-        """Reset both, the second environment last."""
-        found = self.env.reset(**options)
-        with self._between():
-            self._second.reset(seed=self._seed)
-        return found
-
-    def step(self, action: Any) -> Any:
-        """Take the step in both, in the second environment first."""
-        with self._between():
-            _, _, terminated, truncated, _ = self._second.step(np.array(action))
-            if terminated or truncated:
-                self._second.reset(seed=self._seed)
-        return self.env.step(action)
-
-
-@contextlib.contextmanager
-def _kept_generators() -> Iterator[None]:
-    """Restore the global random generators afterwards."""
-    numpy_state, state = np.random.get_state(), random.getstate()  # noqa: NPY002
-    yield
-    np.random.set_state(numpy_state)  # noqa: NPY002
-    random.setstate(state)
 
 
 class Rounding:
@@ -136,7 +88,7 @@ class PlayedValues:
     def problems(self, reward_range: tuple[float, float] | None) -> list[str]:
         """Contradictions to the task, one line each."""
         smallest, largest = reward_range or (-np.inf, np.inf)
-        slack = _ROUNDING * max(1.0, *np.abs([self._lowest, self._highest]))
+        slack = TOLERANCE * max(1.0, *np.abs([self._lowest, self._highest]))
         if smallest - slack <= self._lowest and self._highest <= largest + slack:
             return []
         return [

@@ -13,18 +13,17 @@ import numpy as np
 from gymnasium import spaces
 from pydantic import BaseModel
 
+from music_rllib.envs.beside import Beside
 from music_rllib.envs.episodes import EARLY_END, END_AT_GOAL, Episode, Recording
 from music_rllib.envs.features import beyond_observation
-from music_rllib.envs.make import (
-    Env,
+from music_rllib.envs.goal_functions import (
     augmentation_of,
     goal_end_of,
     goal_reward_of,
-    make_env,
     moved_distance_of,
-    reset_seed,
 )
-from music_rllib.envs.played_values import Beside, PlayedValues
+from music_rllib.envs.make import Env, make_env, reset_seed
+from music_rllib.envs.played_values import PlayedValues
 from music_rllib.envs.tasks import Task, closest
 from music_rllib.envs.values import (
     GOAL_KEYS,

@@ -27,7 +27,7 @@ from ray.rllib.utils.metrics import (
 from ray.rllib.utils.typing import StateDict
 
 from music_rllib.envs.episodes import Episode
-from music_rllib.envs.make import (
+from music_rllib.envs.goal_functions import (
     augmentation_of,
     goal_end_of,
     goal_reward_of,

@@ -34,10 +34,9 @@ from ray.rllib.utils.typing import StateDict
 from music_rllib.config.tac_settings import ColoredNoise, TACSettings
 from music_rllib.envs.episodes import Episode, Recording
 from music_rllib.envs.features import beyond_observation
+from music_rllib.envs.goal_functions import compute_reward_of, compute_terminated_of
 from music_rllib.envs.make import (
     Env,
-    compute_reward_of,
-    compute_terminated_of,
     episode_limit,
     in_environment,
     is_gymnasium_id,

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from music_rllib import names
 from music_rllib.config.load import load_config
 from music_rllib.config.run_settings import Evaluation, RunSettings, Variant, variant_music
-from music_rllib.envs.make import goal_reward_of, make_env
+from music_rllib.envs.goal_functions import goal_reward_of
+from music_rllib.envs.make import make_env
 from music_rllib.envs.tasks import BUILT_IN_TASKS, Task
 from music_rllib.experiment.plan import make_plan
 from music_rllib.replay.buffer import TrajectoryReplay

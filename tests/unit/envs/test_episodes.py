@@ -9,7 +9,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from music_rllib.envs.episodes import Recording, first_mismatch, lost_by_rounding
-from music_rllib.envs.make import goal_end_of, goal_reward_of, make_env
+from music_rllib.envs.goal_functions import goal_end_of, goal_reward_of
+from music_rllib.envs.make import make_env
 from music_rllib.envs.values import BadNumberError
 from music_rllib.replay.trajectories import ReplayLayout
 

@@ -11,7 +11,8 @@ from gymnasium_robotics.utils import mujoco_utils
 from pydantic import ValidationError
 
 from music_rllib.envs.features import Augmentation, Mirror, Symmetries, Symmetry, Translation
-from music_rllib.envs.make import Env, augmentation_of, compute_reward_of, make_env
+from music_rllib.envs.goal_functions import augmentation_of, compute_reward_of
+from music_rllib.envs.make import Env, make_env
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.replay.trajectories import Floats, ReplayLayout, Transitions
 from music_rllib.tac.algorithm import TAC, TACConfig

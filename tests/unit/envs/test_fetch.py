@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from music_rllib.envs.fetch import speed_up
-from music_rllib.envs.make import goal_reward_of, make_env, moved_distance_of
+from music_rllib.envs.goal_functions import goal_reward_of, moved_distance_of
+from music_rllib.envs.make import make_env
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 
 FETCH = [task.env_id for task in BUILT_IN_TASKS.values() if task.env_id.startswith("Fetch")]
