@@ -10,6 +10,7 @@ import shlex
 import shutil
 import sys
 from collections.abc import Collection, Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TextIO, cast
 
 import typer
@@ -41,6 +42,17 @@ def time_option(text: str | float) -> float:
     if not 0 <= value <= 1e6:
         raise typer.BadParameter(f"must be a number from 0 to 1,000,000, got {text}")
     return value
+
+
+def folder_option(text: str | Path) -> Path:
+    """Parser of an option that is a folder: a Path of '' would be the current folder.
+
+    Raises:
+        typer.BadParameter: The text is empty, as that of a variable without a value.
+    """
+    if text == "":
+        raise typer.BadParameter("must name a folder, got ''")
+    return Path(text)
 
 
 def called_as() -> list[str]:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from music_rllib import names
-from music_rllib.command_line import called_as
+from music_rllib.command_line import called_as, folder_option
 from music_rllib.errors import FAILED, BadInputError
 
 if TYPE_CHECKING:
@@ -62,7 +62,11 @@ def report(
     ],
     output: Annotated[
         Path | None,
-        typer.Option(help="Folder for the report; `report` in the sweep's folder by default."),
+        typer.Option(
+            help="Folder for the report; `report` in the sweep's folder by default.",
+            parser=folder_option,
+            metavar="FOLDER",
+        ),
     ] = None,
     storage: Annotated[
         str | None,
@@ -98,7 +102,11 @@ def report(
     ] = False,
     export: Annotated[
         Path | None,
-        typer.Option(help="Write the sweep as tables into this folder instead of a report."),
+        typer.Option(
+            help="Write the sweep as tables into this folder instead of a report.",
+            parser=folder_option,
+            metavar="FOLDER",
+        ),
     ] = None,
     format_: Annotated[
         TableFormat, typer.Option("--format", help="Format of the exported tables.")

@@ -20,6 +20,7 @@ from pyarrow import compute, csv, parquet
 from pydantic import BaseModel, ConfigDict, Field
 
 from music_rllib.errors import reason_of
+from music_rllib.experiment.sweep_files import CONFIG
 from music_rllib.limits import (
     MOST_COLUMNS,
     MOST_JSON_BYTES,
@@ -92,8 +93,8 @@ def _without_folders(place: str) -> str:
 
 
 def is_archive(folder: Path) -> bool:
-    """Whether `folder` holds an exported sweep."""
-    return os.path.lexists(folder / _HEADER)
+    """Whether `folder` holds an exported sweep, and is not that of a sweep itself."""
+    return os.path.lexists(folder / _HEADER) and not os.path.lexists(folder / CONFIG)
 
 
 def write_archive(sweep: Sweep, folder: Path, file_format: Format = "parquet") -> None:
@@ -102,8 +103,15 @@ def write_archive(sweep: Sweep, folder: Path, file_format: Format = "parquet") -
     An export may be published, so it does not contain absolute paths of the machine.
 
     Raises:
-        ReportError: The folder is not writable.
+        ReportError: The folder is not writable, or holds files of a sweep or of the user.
     """
+    tables = [f"{one}.{kind}" for one in ("runs", "metrics") for kind in get_args(Format)]
+    own = (CONFIG, _HEADER, *tables, _SEARCHES, _PLANS)
+    if not is_archive(folder) and (found := [name for name in own if (folder / name).exists()]):
+        raise ReportError(
+            f"--export must be a new folder or that of an earlier export, got {folder}, which has "
+            f"{', '.join(found)}"
+        )
     header: dict[str, Any] = {"version": 1, "format": file_format}
     header |= {name: getattr(sweep, name) for name in _OWN_FIELDS}
     header["source"] = _without_folders(sweep.source)
@@ -123,11 +131,11 @@ def write_archive(sweep: Sweep, folder: Path, file_format: Format = "parquet") -
             if sweep.plans:
                 _write_json(as_document(sweep.plans), new / _PLANS)
             _write_json(header, new / _HEADER)
-            tables = [f"{one}.{kind}" for one in ("runs", "metrics") for kind in get_args(Format)]
             for stale in (*tables, _SEARCHES, _PLANS):
                 if not (new / stale).exists():
                     (folder / stale).unlink(missing_ok=True)
-            for file in new.iterdir():
+            # The header first: without it, what an interruption leaves would not be replaced.
+            for file in sorted(new.iterdir(), key=lambda file: file.name != _HEADER):
                 file.replace(folder / file.name)
     except OSError as error:
         raise ReportError(f"{folder} must be writable: {error}") from error

@@ -25,6 +25,7 @@ from music_rllib.results.conditions import Condition
 from music_rllib.results.data import LastValues, RunRecord, Sweep
 from music_rllib.results.read import searches_of
 from music_rllib.search.best import best_so_far, best_text, condition_of, ranking_metric
+from music_rllib.store.handoff import MANIFEST as HANDOFF_FILE
 from music_rllib.store.storage import StorageError, is_remote, write_atomically
 
 CHOSEN = "chosen.json"
@@ -149,6 +150,11 @@ def _export(opened: OpenSweep, key: str, folder: Path, chosen: Mapping[str, Any]
             for part in Path(temporary).iterdir():
                 target = folder / part.name
                 if target.is_dir():
+                    if not (target / HANDOFF_FILE).is_file():
+                        raise BadInputError(
+                            f"--output must be a new folder or one of `best`, got {folder}: its "
+                            f"{part.name}/ is not a policy's"
+                        )
                     shutil.rmtree(target)
                 part.replace(target)
         document = yaml.safe_dump(sweep_of_run(opened, key, folder), sort_keys=False)

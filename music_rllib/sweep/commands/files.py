@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from music_rllib.command_line import Json, console_for, print_json
+from music_rllib.command_line import Json, console_for, folder_option, print_json
 from music_rllib.errors import BadInputError
 from music_rllib.sweep.commands import Place, StageName, Storage
 
@@ -60,6 +60,7 @@ def best(
         Path | None,
         typer.Option(
             metavar="FOLDER",
+            parser=folder_option,
             help="Target folder; by default 'best' in the folder of the sweep. With several "
             "tasks, each has its own folder inside.",
         ),

@@ -50,6 +50,18 @@ def test_a_csv_export_gives_the_same_frames(tmp_path: Path) -> None:
         pd.testing.assert_frame_equal(getattr(first, name), getattr(second, name))
 
 
+@pytest.mark.parametrize("name", ["runs.csv", "search.json", "config.json"])
+def test_files_that_are_no_export_are_kept(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text("mine")
+    if name == "config.json":  # the folder of a sweep, into which an export was once written
+        (tmp_path / "sweep.json").write_text("{}")
+    before = sorted(tmp_path.iterdir())
+    with pytest.raises(ReportError, match=f"must be a new folder .*{name}"):
+        write_archive(read_archive(EXPORT), tmp_path)
+    assert sorted(tmp_path.iterdir()) == before
+    assert (tmp_path / name).read_text() == "mine"
+
+
 @pytest.mark.parametrize("file_format", get_args(Format))
 def test_an_export_without_runs_can_be_read(tmp_path: Path, file_format: Format) -> None:
     write_archive(replace(read_archive(EXPORT), runs=[], history={}), tmp_path, file_format)

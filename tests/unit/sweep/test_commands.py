@@ -286,6 +286,15 @@ def test_best_takes_the_middle_run_of_the_best_condition(
     assert (folder / "mine" / "handoff").exists()
     assert (again.code, "train q = 1.5: success " in again.output) == (0, True)
     assert "entropy -0.32 nats" in again.output
+    own = Path("own/handoff/thesis.txt")
+    own.parent.mkdir(parents=True)
+    own.touch()
+    refused = program("best", f"{storage}/mine", "--output", "own")
+    assert (refused.code, "handoff/ is not a policy's" in in_one_line(refused.errors)) == (2, True)
+    assert own.exists()
+    for options in (("best", "--output"), ("report", "--output"), ("report", "--export")):
+        refused = program(options[0], f"{storage}/mine", options[1], "")
+        assert (refused.code, "must name a folder" in in_one_line(refused.errors)) == (2, True)
 
 
 @pytest.mark.parametrize(
