@@ -72,7 +72,7 @@ def read_sweep(
         BadInputError: There is no such sweep.
         StorageError: The storage can't be read, or finished runs in it are damaged.
     """
-    folder = folder_at(place)
+    folder = folder_at(place) if storage is None or "/" in place else None
     if folder is not None and is_archive(folder):
         sweep = read_archive(folder)
         if metrics is not None:

@@ -13,9 +13,11 @@ import pandas as pd
 import pytest
 
 from music_rllib import load_sweep, names
+from music_rllib.errors import BadInputError
 from music_rllib.results.archive import Format, read_archive, write_archive
 from music_rllib.results.data import Points, ReportError, columns
 from music_rllib.results.frames import frames_of
+from music_rllib.results.read import read_sweep
 
 DOCS = Path(__file__).parents[3] / "docs"
 EXPORT = DOCS / "results" / "data" / "v3-fetch-push-music-f"
@@ -41,6 +43,17 @@ def test_joined_frames_equal_the_export() -> None:
     again = frames.runs.groupby(["stage", "task", "condition"]).score.mean()
     said = frames.conditions.set_index(["stage", "task", "condition"])["mean"]
     pd.testing.assert_series_equal(again.sort_index(), said.sort_index(), check_names=False)
+
+
+def test_a_name_in_a_storage_is_not_an_export_beside_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_archive(read_archive(EXPORT), tmp_path / "mine")
+    assert read_sweep("mine").sweep.name == read_archive(EXPORT).name
+    assert read_sweep("./mine", "elsewhere").sweep.name == read_archive(EXPORT).name
+    with pytest.raises(BadInputError, match="elsewhere/mine"):
+        read_sweep("mine", "elsewhere")
 
 
 def test_a_csv_export_gives_the_same_frames(tmp_path: Path) -> None:
