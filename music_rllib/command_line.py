@@ -131,6 +131,10 @@ def console_for(*, as_json: bool = False, unfailing: bool = False) -> Console:
             for text, style, control in super().render(renderable, options):
                 yield Segment(text if control else printable(text), style, control)
 
+        def on_broken_pipe(self) -> None:
+            """Let the command end with 0, as with `print`; rich would exit with 1."""
+            raise BrokenPipeError
+
     stream = sys.stderr if as_json else sys.stdout
     terminal = stream.isatty()
     return PrintableConsole(

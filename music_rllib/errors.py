@@ -62,6 +62,8 @@ class BadInputError(Exception):
     The message names the place, the rule and the value. Commands print it without a traceback.
     """
 
+    exit_code = BAD_INPUT
+
 
 class TrackingError(BadInputError, RuntimeError):
     """Tracking cannot be set up.

@@ -20,7 +20,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from music_rllib import __version__
 from music_rllib.command_line import PROGRAM
-from music_rllib.errors import BAD_INPUT, BadInputError
+from music_rllib.errors import BadInputError
 from music_rllib.redaction import for_people
 from music_rllib.report import cli as report
 from music_rllib.runtime.quiet import prepare_environment, quiet_third_parties
@@ -84,7 +84,7 @@ class Command(_KeepsExamples, TyperCommand):
             code = super().invoke(ctx)
         except BadInputError as error:
             print(f"error: {for_people(error)}", file=sys.stderr)
-            code = BAD_INPUT
+            code = error.exit_code
         except KeyboardInterrupt:
             code = 128 + signal.SIGINT
         except BrokenPipeError:

@@ -259,8 +259,7 @@ def lay_overrides(document: Document, overrides: Mapping[str, Any]) -> None:
         ConfigError: One names a stage that does not exist, or a setting that a grid or search
             varies.
     """
-    # Those of one stage are the last ones, in any order of the arguments.
-    for key, value in sorted(overrides.items(), key=lambda item: item[0].startswith("stages.")):
+    for key, value in sorted(overrides.items(), key=_turn):
         place: KeyPath = tuple(key.split("."))
         if place[0] in LAYER_KEYS:
             for stage in _stages(document):
@@ -273,6 +272,16 @@ def lay_overrides(document: Document, overrides: Mapping[str, Any]) -> None:
         elif place[0] == "stages" and len(place) > 1:
             place = _place_in_stage(document, key)
         document.put(place, value)
+
+
+def _turn(override: tuple[str, Any]) -> int:
+    """The turn of an override, in any order of the arguments: those of one stage come last.
+
+    A new grid or search of a stage comes first: it decides which settings may be given.
+    """
+    if not override[0].startswith("stages."):
+        return 1
+    return 0 if override[0].endswith((".grid", ".search")) else 2
 
 
 def _check_not_varied(stage: Mapping[str, Any], key: str, value: Any) -> None:

@@ -175,7 +175,9 @@ def problems_of(error: ValidationError, document: Any, kind: type[BaseModel]) ->
             continue  # pydantic counts valid entries only; the invalid ones are reported
         path, rule = _without_tags(details["loc"], document), _rule(details)
         if details["type"] == "extra_forbidden":
-            rule = unknown(str(path[-1]), known_fields(kind, path[:-1]))
+            *section, key = map(str, path)
+            known = (".".join([*section, name]) for name in known_fields(kind, path[:-1]))
+            rule = unknown(".".join([*section, key]), known)
         elif details["type"] == "missing":
             path = (*path, details["loc"][-1])
         elif details["type"] == "value_error":

@@ -41,7 +41,7 @@ def read_yaml(path: Path) -> YamlFile:
         ConfigError: The file is missing, unreadable or not a valid YAML mapping.
     """
     try:
-        text = read_regular(path, MOST_YAML_BYTES, follow=True).decode("utf-8")
+        text = read_regular(path, MOST_YAML_BYTES, follow=True).decode("utf-8-sig")
     except FileNotFoundError:
         raise ConfigError([f"{path}: must be an existing file"]) from None
     except (OSError, UnicodeDecodeError) as error:

@@ -126,9 +126,12 @@ def find_sweep(place: str, storage: str | None) -> SweepLocation:
     location = _locate(place, storage)
     check_answers(location.storage)
     if location.read(CONFIG) is None:
+        got = f"SWEEP must be a sweep that was started, got {redact(place)}"
+        if (inside := _names(location.files)) != "none":
+            raise BadInputError(f"{got}, a storage with the sweeps {inside}")
         raise BadInputError(
-            f"SWEEP must be a sweep that was started, got {redact(place)}: there is no "
-            f"{location.place}/{CONFIG} (sweeps there: {_names(location.storage)})"
+            f"{got}: there is no {location.place}/{CONFIG} "
+            f"(sweeps there: {_names(open_storage(location.storage))})"
         )
     return location
 
@@ -150,10 +153,10 @@ def _locate(place: str, storage: str | None) -> SweepLocation:
     return SweepLocation(storage=resolve_storage(storage or "results")[0], name=place)
 
 
-def _names(storage: str) -> str:
+def _names(root: StorageFolder) -> str:
     """Names of the sweeps in a storage, for messages."""
     with contextlib.suppress(OSError):  # the path cannot exist: a name in it is too long
-        return ", ".join(sorted(sweep.name for sweep in sweeps_in(storage))) or "none"
+        return ", ".join(sorted(root.having(PLAN, root.folders()))) or "none"
     return "none"
 
 

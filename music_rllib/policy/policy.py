@@ -141,7 +141,7 @@ def policy_from_folder(folder: Path, env: str | Sequence[Task] = ()) -> Policy:
     try:
         handoff_parent, manifest = open_handoff(folder)
     except HandoffError as error:
-        raise _several_policies(folder) or error from None
+        raise _other_folder(folder) or error from None
     info = manifest.info
     wanted = ["policy", "normaliser"] if info.architecture.normalise_observations else ["policy"]
     parts = read_handoff(handoff_parent, wanted, info.task)
@@ -154,8 +154,13 @@ def policy_from_folder(folder: Path, env: str | Sequence[Task] = ()) -> Policy:
     return _policy(network, env)
 
 
-def _several_policies(folder: Path) -> PolicyError | None:
-    """The error for a folder of `best` with a sub-folder for each task; None for any other."""
+def _other_folder(folder: Path) -> PolicyError | None:
+    """The error for a sweep, or the sub-folders that `best` writes for tasks; None for others."""
+    if (folder / "plan.json").is_file():
+        return PolicyError(
+            f"{folder} must hold a policy, and is a sweep: give the label of one of its runs, or "
+            f"write its best policy with 'music-rllib best {folder}'"
+        )
     policies = [str(child.parent) for child in sorted(folder.glob("*/handoff"))]
     if not policies or (folder / "handoff").exists() or (folder / HANDOFF_FILE).exists():
         return None
@@ -299,6 +304,8 @@ def find_policy(wanted: str, storage: str) -> str:
     Raises:
         PolicyError: No run matches, or several do; the message lists them.
     """
+    if not wanted:
+        raise PolicyError("the run must not be empty, got ''")
     if "://" in wanted or wanted.startswith(("models:/", "runs:/")) or os.path.lexists(wanted):
         return wanted
     storage = resolve_storage(storage)[0]

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import json
 import os
 import re
+import signal
+import sys
 import threading
 import warnings
 from collections import Counter
@@ -256,7 +259,10 @@ def _drawn(figures: Sequence[Figure]) -> Iterator[Iterator[Mapping[str, bytes]]]
         return
     # Functions that draw cannot be pickled, so the processes inherit the figures.
     with ProcessPoolExecutor(
-        min(cores, len(figures), MOST_PROCESSES), get_context("fork"), _INHERITED.extend, (figures,)
+        min(cores, len(figures), MOST_PROCESSES),
+        get_context("fork"),
+        _inherit,
+        (figures, os.getpid()),
     ) as pool:
         with warnings.catch_warnings():  # of Python 3.12, about the idle threads of BLAS
             warnings.simplefilter("ignore", DeprecationWarning)
@@ -265,6 +271,16 @@ def _drawn(figures: Sequence[Figure]) -> Iterator[Iterator[Mapping[str, bytes]]]
 
 
 _INHERITED: list[Figure] = []
+_SET_DEATH_SIGNAL = 1
+"""PR_SET_PDEATHSIG of Linux."""
+
+
+def _inherit(figures: Sequence[Figure], parent: int) -> None:
+    """Keep the figures in a drawing process, which ends with its parent."""
+    ctypes.CDLL(None).prctl(_SET_DEATH_SIGNAL, signal.SIGTERM)
+    if os.getppid() != parent:  # it has ended already
+        sys.exit()
+    _INHERITED.extend(figures)
 
 
 def _draw_inherited(number: int) -> Mapping[str, bytes]:

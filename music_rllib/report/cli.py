@@ -95,8 +95,8 @@ def report(
         ),
     ] = False,
     port: Annotated[
-        int, typer.Option(min=0, max=65535, help="With --serve; 0 selects a free port.")
-    ] = 0,
+        int | None, typer.Option(min=0, max=65535, help="With --serve. Default: a free port.")
+    ] = None,
     attach: Annotated[
         bool, typer.Option("--attach", help="Also store the report with the sweep's run in MLflow.")
     ] = False,
@@ -109,8 +109,11 @@ def report(
         ),
     ] = None,
     format_: Annotated[
-        TableFormat, typer.Option("--format", help="Format of the exported tables.")
-    ] = TableFormat.parquet,
+        TableFormat | None,
+        typer.Option(
+            "--format", help="With --export: format of the tables.", show_default="parquet"
+        ),
+    ] = None,
     add: Annotated[
         bool,
         typer.Option("--add", help="With --export: keep the runs of an earlier export there."),
@@ -120,8 +123,13 @@ def report(
 
     The page is self-contained; its figures (PNG, SVG) and numbers (CSV) are also files.
     """
-    if add and export is None:
-        raise BadInputError("--add must be given with --export")
+    for option, needs, is_lone in (
+        ("--add", "--export", add and export is None),
+        ("--format", "--export", format_ is not None and export is None),
+        ("--port", "--serve", port is not None and not serve),
+    ):
+        if is_lone:
+            raise BadInputError(f"{option} must be given with {needs}")
     if serve and (export or output or attach):
         raise BadInputError("--serve must be given without --export, --output and --attach")
     if len(sweeps) > 1 and (len(sweeps) > 2 or serve or attach or export is not None):
@@ -130,9 +138,9 @@ def report(
             "--export"
         )
     if export is not None:
-        _export(sweeps[0], storage, export, format_, add=add)
+        _export(sweeps[0], storage, export, format_ or TableFormat.parquet, add=add)
     elif serve:
-        _serve(sweeps[0], storage, port)
+        _serve(sweeps[0], storage, port or 0)
     else:
         return _report(sweeps, storage, output, env, videos=videos, attach=attach)
     return 0

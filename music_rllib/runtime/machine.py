@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import psutil
 
-from music_rllib.errors import BadInputError
+from music_rllib.errors import FAILED, BadInputError
 
 if TYPE_CHECKING:
     from music_rllib.config.schema import Resources
@@ -47,6 +47,12 @@ MEMORY_LIMITS = ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/
 
 class ClusterError(BadInputError, RuntimeError):
     """Ray cannot be reached, or cannot hold a run."""
+
+
+class RayStartError(ClusterError):
+    """A local Ray did not start."""
+
+    exit_code = FAILED
 
 
 def cluster_address() -> str | None:

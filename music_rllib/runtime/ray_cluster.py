@@ -22,6 +22,7 @@ from music_rllib.errors import first_line
 from music_rllib.runtime.machine import (
     RAY_FOLDER,
     ClusterError,
+    RayStartError,
     check_cpus,
     cluster_address,
     free_memory,
@@ -114,7 +115,7 @@ def start_ray(**local_options: Any) -> None:
         stop_ray()
         cause = first_line(error)
         if address is None:
-            raise ClusterError(
+            raise RayStartError(
                 f"Ray did not start on this machine, which may be too busy for it: {cause}"
             ) from error
         raise ClusterError(

@@ -39,7 +39,7 @@ class ServeSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    policy: str = Field(min_length=1)
+    policy: str
     """Folder or URI of a finished node, an exported policy, or a run's key or label."""
     storage: str = "results"
     """Storage in which keys and labels are looked up."""

@@ -208,6 +208,7 @@ def open_storage(uri: str) -> StorageFolder:
     Raises:
         StorageError: The URI is not valid, or the place cannot be reached.
     """
+    _check_uri(uri)
     try:
         if "://" not in uri:
             uri = str(Path(uri).expanduser().absolute())
@@ -241,12 +242,8 @@ def resolve_storage(storage: str) -> tuple[str, str | None]:
         StorageError: The storage begins with the home folder of an unknown user, is a URI without
             a bucket, or not `file:///FOLDER`.
     """
-    if storage.startswith("file:") and not re.fullmatch(r"file:///[^?#]+", storage):
-        raise StorageError(f"storage must be a folder, or file:///FOLDER, got {storage!r}")
+    _check_uri(storage)
     if "://" in storage:
-        host = re.split("[/?]", storage.partition("://")[2])[0]
-        if storage.startswith(BUCKETS) and not host.rpartition("@")[2]:
-            raise StorageError(f"storage must name a bucket, got {redact(storage)!r}")
         return storage, None
     try:
         path = Path(storage).expanduser()
@@ -260,6 +257,14 @@ def resolve_storage(storage: str) -> tuple[str, str | None]:
         f"storage {storage!r} is relative and a Ray job's working directory is temporary: "
         f"using {resolved}. Give an absolute path or a bucket to choose another place."
     )
+
+
+def _check_uri(storage: str) -> None:
+    """Reject a URI without a bucket, with one slash, or not of the form `file:///FOLDER`."""
+    if storage.startswith("file:") and not re.fullmatch(r"file:///[^?#]+", storage):
+        raise StorageError(f"storage must be a folder, or file:///FOLDER, got {storage!r}")
+    if re.match(r"(s3|gs|gcs|abfss?):(?!//)|(s3|gs|gcs|abfss?)://([^/?]*@)?([/?]|$)", storage):
+        raise StorageError(f"storage must name a bucket as in s3://BUCKET, got {redact(storage)!r}")
 
 
 def is_remote(storage: str) -> bool:

@@ -99,8 +99,12 @@ class RunStorage:
         assert self.lease is not None
         self.lease.end()
         self.lease = None
-        self._note("another process took over while this one was suspended; writing nothing more")
-        return str(self.work.lease.read() or "another process")
+        holder = self.work.lease.read()
+        deleted = ", or its folder in the storage was deleted" if holder is None else ""
+        self._note(
+            f"another process took over while this one was suspended{deleted}; writing nothing more"
+        )
+        return str(holder or "another process")
 
     def clear(self) -> None:
         """Delete the checkpoints and the lease of a finished run, if this process holds it."""

@@ -120,6 +120,21 @@ print("trained", file=sys.stderr)
         assert (done.returncode, done.stderr) == (0, "trained\n")
 
 
+def test_a_table_for_a_reader_that_has_ended_is_not_a_failure() -> None:
+    code = """
+import os
+from music_rllib.command_line import console_for
+read, write = os.pipe()
+os.close(read)
+os.dup2(write, 1)
+try:
+    console_for().print("line")
+except BrokenPipeError:  # `Command` ends with 0
+    os._exit(7)
+"""
+    fresh("-c", code, code=7)
+
+
 def test_every_help_page_has_the_same_format(
     capsys: pytest.CaptureFixture[str], monkeypatch: Any
 ) -> None:

@@ -59,6 +59,7 @@ _DASHES: tuple[tuple[float, ...], ...] = (
     (13, 3),
     (6, 2, 1.5, 2, 1.5, 2),
 )
+_LARGEST_Q = 1e6
 _ALIKE = 60.0
 """Distance in RGB below which two thin lines look the same, such as those of q = 1 and 1.1."""
 
@@ -130,11 +131,15 @@ def _are_alike(one: str, other: str) -> bool:
 
 
 def _number(entropic_index: str) -> float | None:
-    """The number of `1.5`, the last one of `1 to 2 by steps (..)`; None for other text."""
+    """The number of `1.5`, the last one of `1 to 2 by steps (..)`; None for other text.
+
+    Also None for NaN and numbers that no run can have, as an export of a stranger can contain.
+    """
     try:
-        return float(entropic_index.split(" (")[0].split(" by ")[0].rpartition(" ")[2])
+        q = float(entropic_index.split(" (")[0].split(" by ")[0].rpartition(" ")[2])
     except ValueError:
         return None
+    return q if abs(q) < _LARGEST_Q else None
 
 
 def _channels(color: str) -> tuple[int, int, int]:

@@ -79,6 +79,12 @@ def slurm(
     options = {"job-name": config.name, "time": time, "cpus-per-task": cpus, "partition": partition}
     lines = [f"--{key}={value}" for key, value in options.items() if value is not None]
     lines += [*FIXED, *(sbatch or ())]
+    for line in lines:
+        if not line.startswith("-") or not line.isprintable():
+            raise BadInputError(
+                f"--sbatch and --partition must give one option of sbatch on one line, such as "
+                f"--sbatch=--account=lab, got {line!r}"
+            )
     given = {"--storage": storage, "--name": name, "--seeds": seeds}
     command = [sys.executable, "-m", "music_rllib", "run", str(file), *(overrides or ())]
     command += [part for key, value in given.items() if value for part in (key, value)]

@@ -5,10 +5,13 @@ from __future__ import annotations
 import dataclasses
 import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import get_args
 
 import numpy as np
+import psutil
 import pytest
 from typer.testing import CliRunner, Result
 
@@ -24,7 +27,7 @@ from music_rllib.results.data import Sweep
 from music_rllib.results.read import read_sweep
 from music_rllib.store.history import HISTORY, Report, RunResult, last_values, to_json_lines
 from music_rllib.sweep.listeners.state_file import StateFile
-from tests.processes import fresh
+from tests.processes import fresh, wait_until
 from tests.sweep_files import loaded
 
 STEPS = range(20_000, 100_001, 20_000)
@@ -296,3 +299,12 @@ def test_a_sweep_that_does_not_exist_or_fit_is_refused(sweep_folder: Path, tmp_p
     )
     never = run(sweep_folder, "--attach", "--no-videos")
     assert (never.exit_code, "a sweep that was tracked" in never.stderr) == (2, True)
+
+
+def test_drawing_processes_end_with_the_command(tmp_path: Path) -> None:
+    export = Path(__file__).parents[3] / "docs/results/data/joint-pick"
+    command = [sys.executable, "-m", "music_rllib", "report", str(export), "--no-videos"]
+    with subprocess.Popen([*command, "--output", str(tmp_path / "report")]) as process:
+        drawing = wait_until(psutil.Process(process.pid).children, 60)
+        process.terminate()
+    wait_until(lambda: not any(one.is_running() and one.status() != "zombie" for one in drawing), 9)

@@ -311,7 +311,7 @@ BAD: list[tuple[Document, str]] = [
         changed(resources={"num_cpus": 2, "cpus_per_run": 3}),
         "resources.cpus_per_run must be <= num_cpus (2), got 3",
     ),
-    (changed(mlflow={"tracking_url": "x"}), "(did you mean 'tracking_uri'?)"),
+    (changed(mlflow={"tracking_url": "x"}), "(did you mean 'mlflow.tracking_uri'?)"),
     (changed(environments={"FetchPush": {}}), "environments.FetchPush is a built-in task"),
     (changed(environments={"A": {"env_id": "A-v0"}}), "environments.A.horizon must be given"),
     (changed(defaults={"env_steps": 6.5e-1}), "env_steps must be a whole number, got 0.65"),
@@ -357,7 +357,7 @@ BAD: list[tuple[Document, str]] = [
         with_stage(0, tac={"alpha": {"value": 0.1, "normalised": False}}),
         "stages.pretrain.tac.alpha.normalised must be",
     ),
-    (with_stage(0, tac={"hiden_sizes": [1]}), "(did you mean 'hidden_sizes'?)"),
+    (with_stage(0, tac={"hiden_sizes": [1]}), "(did you mean 'tac.hidden_sizes'?)"),
     (
         with_stage(
             0,

@@ -81,6 +81,12 @@ def test_values_inside_a_setting_and_a_grid(tmp_path: Path) -> None:
     assert {run.tac.alpha.value for run in second} == {0.3}  # type: ignore[union-attr]
 
 
+def test_a_setting_may_replace_a_grid_that_varied_it(tmp_path: Path) -> None:
+    arguments = "tac.entropic_index=3", "stages.second.grid={}"
+    for given in (arguments, arguments[::-1]):
+        assert [run.tac.entropic_index for run in runs(load(tmp_path, *given))] == [3, 3]
+
+
 def test_a_preset_of_the_command_line_is_below_the_file(tmp_path: Path) -> None:
     first = runs(load(tmp_path, "preset=small"))[0]
     assert (first.tac.tau, first.tac.gamma) == (0.05, 0.9)
@@ -213,6 +219,7 @@ REFUSED: list[tuple[str, str]] = [
     ("env_steps=1.5", "command line: env_steps must be a whole number, got 1.5"),
     ("tac.lr", "command line: must be KEY=VALUE like tac.alpha=0.1"),
     ("tac.lr=[", "command line: tac.lr must be valid YAML"),
+    ("tac.aplha=1", "tac.aplha is not a known setting (did you mean 'tac.alpha'?)"),
     ("storage=", "command line: storage must be text, got null"),
     ("tasks.0=1", 'command line: tasks.0 must be inside of a mapping, got ["FetchReach"] at tasks'),
     ("tac.alpha.value=1", "command line: tac.alpha.value must be a whole setting, tac.alpha="),
@@ -239,7 +246,7 @@ def test_mistakes_of_two_arguments(tmp_path: Path) -> None:
 FILES: list[tuple[str, Any]] = [
     ("defaults: {q: 1.5}", "defaults.q is not a known setting (did you mean 'tac.entropic_index'"),
     ("q: 1.5", "q is not a known setting (did you mean 'defaults.tac.entropic_index'?)"),
-    ("defaults: {tac: {q: 1.5}}", "defaults.tac.q is not a known setting (did you mean 'entropic"),
+    ("defaults: {tac: {q: 1.5}}", "defaults.tac.q is not a known setting (did you mean 'tac.entro"),
     ("defaults: {tac: {alpha: [.1, .2]}}", "got [0.1, 0.2]; values to compare belong in a stage's"),
     ("defaults: {env_steps: 1e6, num_envs: 1.5}", "num_envs must be a whole number, got 1.5"),
     ("defaults: {tac: {random_steps: 3e5}}", "env_steps must be > tac.random_steps (300000)"),

@@ -115,6 +115,10 @@ def test_invalid_files_are_rejected_with_their_line(
     assert message in str(refusal.value)
 
 
+def test_a_byte_order_mark_is_not_part_of_the_text(tmp_path: Path) -> None:
+    assert read(tmp_path, "\ufeffname: a\n").data == {"name": "a"}
+
+
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"missing\.yaml: must be an existing file"):
         read_yaml(tmp_path / "missing.yaml")

@@ -66,6 +66,8 @@ def test_a_color_depends_on_q_alone() -> None:
     assert len({color_of(str(q)) for q in np.arange(0.5, 3.01, 0.25)}) == 11
     grid = ("1", "1.25", "1.5", "1.75", "2")
     assert len({marker_of(q) for q in grid}) == len(grid)
+    for q in ("inf", "nan", "-1e308"):  # of a stranger's export
+        assert (color_of(q), marker_of(q)) == (color_of("learned"), marker_of("learned"))
 
 
 def test_conditions_with_the_same_q_differ_with_and_without_color() -> None:

@@ -299,6 +299,7 @@ def test_a_ray_that_does_not_start_is_reported_in_one_line(
     monkeypatch.setattr(ray_cluster, "cluster_address", lambda: address)
     with pytest.raises(ClusterError) as caught, ray_cluster.cluster(Resources()):
         pass
+    assert caught.value.exit_code == (1 if address is None else 2)
     said = str(caught.value)
     assert "timed out during startup" in said
     assert "\n" not in said

@@ -191,7 +191,7 @@ MISTAKES: list[tuple[Document, str]] = [
     ),
     (
         {"space": {"tac.entropic_indx": {"float": [1, 2]}}},
-        "is not a known setting (did you mean 'entropic_index'?)",
+        "is not a known setting (did you mean 'tac.entropic_index'?)",
     ),
     (
         {"space": {"seed": {"int": [1, 2]}}},

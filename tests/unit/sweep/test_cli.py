@@ -334,8 +334,13 @@ LONG = "x" * 300
         (("status", "sweep.yaml", "--storage", ""), "--storage must not be empty, got ''"),
         (("evaluate", "a/seed0", "--storage", ""), "--storage must not be empty, got ''"),
         (("status", ""), "SWEEP must not be empty, got ''"),
-        (("plan", "sweep.yaml", "--storage", "s3://"), "storage must name a bucket, got 's3://'"),
-        (("evaluate", "x", "--storage", "s3://?region=x"), "storage must name a bucket, got "),
+        (("report", "s", "--port", "0"), "--port must be given with --serve"),
+        (("report", "s", "--format", "csv"), "--format must be given with --export"),
+        (("plan", "sweep.yaml", "--storage", "s3://"), "storage must name a bucket"),
+        (("evaluate", "s3://"), "s3:// must hold a policy: storage must name a bucket"),
+        (("compare", "s3:/b/c"), "storage must name a bucket as in s3://BUCKET, got 's3:/b'"),
+        (("serve", ""), "the run must not be empty, got ''"),
+        (("evaluate", "x", "--storage", "s3://?region=x"), "storage must name a bucket as "),
         (("evaluate", "x", "--storage", "~nobody-at-all/x"), "storage must be in a home that is"),
         (
             ("evaluate", "x", "--storage", "sweep.yaml"),
@@ -386,6 +391,15 @@ def test_resume_needs_a_sweep(program: Program, tmp_path: Path) -> None:
     result = program(None, "resume", str(tmp_path / "results/s"))
     assert result.exit_code == 2
     assert "SWEEP must be a sweep that was started" in result.stderr
+
+
+def test_a_storage_or_sweep_in_place_of_what_it_contains(program: Program, tmp_path: Path) -> None:
+    (tmp_path / "results/s").mkdir(parents=True)
+    (tmp_path / "results/s/plan.json").write_text("{}")
+    result = program(None, "compare", "results")
+    assert "got results, a storage with the sweeps s\n" in result.stderr
+    result = program(None, "evaluate", "results/s")
+    assert "results/s must hold a policy, and is a sweep" in result.stderr
 
 
 def test_a_folder_that_is_not_there(program: Program, tmp_path: Path) -> None:

@@ -1049,6 +1049,11 @@ def test_slurm_writes_a_job_array_and_submits_it(
     Path("smoke.slurm.sh").write_text("mine")
     refused = program(*command)
     assert (refused.code, "must not be a file of another origin" in refused.errors) == (2, True)
-    for wrong, said in (("--time=5h", "--time must be a time of Slurm"), ("tac.gamma=7", "< 1")):
+    for wrong, said in (
+        ("--time=5h", "--time must be a time of Slurm"),
+        ("--partition=a\n#b", "on one line"),
+        ("--sbatch=account=me", "--sbatch and --partition must"),
+        ("tac.gamma=7", "< 1"),
+    ):
         refused = program(*command, wrong)
         assert (refused.code, said in refused.errors) == (2, True)
