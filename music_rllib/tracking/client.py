@@ -33,7 +33,12 @@ from music_rllib.errors import TrackingError
 from music_rllib.redaction import redact
 from music_rllib.runtime.process import without_collections
 from music_rllib.tracking.policy_model import MODEL_NAME, write_model
-from music_rllib.tracking.store import TrackingStore, empty_database, keep_empty_database
+from music_rllib.tracking.store import (
+    TrackingStore,
+    empty_database,
+    follow_moved_storage,
+    keep_empty_database,
+)
 
 MAX_METRICS, MAX_PARAMS = 1000, 100
 """MLflow's limits for one request: metrics, or metrics, params and tags together; and params."""
@@ -363,6 +368,8 @@ def open_client(store: TrackingStore) -> MlflowClient:
             client.search_experiments(max_results=1)
             if is_new:
                 keep_empty_database(store.database, VERSION)
+            if store.artifact_root is not None:
+                follow_moved_storage(store.database, store.artifact_root)
             return client
     except (OSError, TimeoutError) as error:
         raise TrackingError(

@@ -42,6 +42,17 @@ SETTING, VARIABLE = "mlflow.tracking_uri", "MLFLOW_TRACKING_URI"
 """The setting of a sweep, and MLflow's own variable, which is used if the setting is absent."""
 _LOW_MEMORY = "MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false"
 """Keeps a server of MLflow 3 from starting job consumers (2.5 GB), which tracking never uses."""
+_PLACES = (
+    ("experiments", "artifact_location"),
+    ("runs", "artifact_uri"),
+    ("logged_models", "artifact_location"),
+)
+"""Tables and columns of MLflow's database with the URIs of artifacts."""
+_OTHER_PLACES = (
+    "SELECT 1 FROM experiments WHERE artifact_location LIKE ?1 "
+    "AND substr(artifact_location, 1, length(?2)) != ?2"
+)
+_LOCK_SECONDS = 60
 RECORD = "tracking/sweep.json"
 """File of a `SweepRecord` in the sweep's folder."""
 
@@ -253,6 +264,23 @@ def _origin(uri: str) -> str:
     if uri != database_url(os.environ.get(VARIABLE, "")):
         return SETTING
     return f"{SETTING} (from the environment variable {VARIABLE})"
+
+
+def follow_moved_storage(database: Path, artifact_root: str) -> None:
+    """Correct the artifact URIs in the database of a storage that was moved or copied.
+
+    MLflow records absolute URIs, so it would read and write in the earlier folder.
+    """
+    root, known = f"{artifact_root}/", "file:%/mlartifacts/%"
+    with closing(sqlite3.connect(database, timeout=_LOCK_SECONDS)) as connection, connection:
+        if not connection.execute(_OTHER_PLACES, (known, root)).fetchone():
+            return
+        for table, column in _PLACES:
+            connection.execute(
+                f"UPDATE {table} SET {column} = ? || "  # noqa: S608 - constants
+                f"substr({column}, instr({column}, '/mlartifacts/') + 13) WHERE {column} LIKE ?",
+                (root, known),
+            )
 
 
 def empty_database(version: str) -> Path:

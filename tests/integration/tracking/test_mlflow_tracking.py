@@ -83,15 +83,19 @@ class FreshStore(NamedTuple):
     screen: str
 
 
+ONE_SWEEP = """
+import sys
+from music_rllib.tracking.tracker import Tracker
+config = {"name": "smoke", "seeds": [0]}
+Tracker(sweep_name=sys.argv[1], storage=sys.argv[2], config=config).close()
+"""
+
+
 @pytest.fixture(scope="module")
 def fresh_store(tmp_path_factory: pytest.TempPathFactory) -> FreshStore:
     """Created once, because MLflow's tables take seconds and a copy does not."""
     folder = tmp_path_factory.mktemp("first")
-    code = (
-        "import sys; from music_rllib.tracking.tracker import Tracker; "
-        "Tracker(sweep_name='first', storage=sys.argv[1], config={}).close()"
-    )
-    done = fresh("-c", code, folder)
+    done = fresh("-c", ONE_SWEEP, "first", folder)
     return FreshStore(folder / "mlflow.db", done.stdout + done.stderr)
 
 
@@ -539,6 +543,23 @@ def test_a_report_is_attached_to_the_sweeps_run(
     assert found.path == "report/report.html"
     noted = runs_of(client_of(storage))["smoke"].data.tags[names.TAG_NOTE]
     assert noted == "**q = 1.5 is better**"
+
+
+def test_a_moved_storage_keeps_its_artifacts(
+    storage: Path, tracker_on: MakeTracker, tmp_path: Path
+) -> None:
+    # In another process, because MLflow caches a run's place of artifacts.
+    fresh("-c", ONE_SWEEP, "smoke", storage)
+    moved = tmp_path / "moved"
+    storage.rename(moved)
+    tracker = tracker_on(storage=str(moved))
+    tracker.start(run_info("a"))
+    tracker.close()
+    assert not storage.exists(), "nothing is written into the earlier folder"
+    for run in runs_of(client := client_of(moved)).values():
+        place = f"/{run.info.run_id}/artifacts"
+        assert run.info.artifact_uri == f"{moved.as_uri()}/mlartifacts/smoke{place}"
+    assert client.list_artifacts(tracker.parent_run_id)
 
 
 def test_tracking_prints_nothing(fresh_store: FreshStore) -> None:
