@@ -44,6 +44,7 @@ COUNTED = {
 }
 """Steps of the studies whose metric counts the pretraining."""
 IN_DETAIL = {
+    "equal-entropy-fixed": "## FetchPush at equal entropy\n",
     "equal-entropy": "**With a learned α**",
     "joint-her": "## FetchPush in the joint form, HER alone\n",
     "claims-push": "## FetchPush\n",
