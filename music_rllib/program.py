@@ -156,6 +156,9 @@ def main(arguments: Sequence[str] | None = None, program_name: str = PROGRAM) ->
     # Ray and MLflow read their environment while they are imported.
     prepare_environment()
     quiet_third_parties()
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by what started the program
+            setattr(sys, name, Path(os.devnull).open("w"))  # noqa: SIM115 - to the end
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a terminal without α shows it as \u03b1
             stream.reconfigure(errors="backslashreplace")

@@ -135,6 +135,14 @@ except BrokenPipeError:  # `Command` ends with 0
     fresh("-c", code, code=7)
 
 
+@pytest.mark.parametrize("closed", ["1", "2"])
+def test_output_may_be_closed(closed: str) -> None:
+    command = f"exec '{sys.executable}' -m music_rllib presets --json {closed}>&-"
+    done = subprocess.run(["sh", "-c", command], cwd=REPOSITORY, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert bool(done.stdout) == (closed == "2")
+
+
 def test_every_help_page_has_the_same_format(
     capsys: pytest.CaptureFixture[str], monkeypatch: Any
 ) -> None:
