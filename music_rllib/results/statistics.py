@@ -31,6 +31,8 @@ POWER = 0.8
 """Probability of detecting a difference for which seeds are planned."""
 MAX_SEEDS = 1000
 """Largest number of seeds that is tried when planning."""
+IMPORTANCE_TRIALS = 10
+"""Complete trials that an estimate of the settings' importance needs."""
 SHOW_SEEDS_BELOW = 10
 """Number of seeds from which on single seeds are not listed."""
 FEWEST_FOR_INTERVAL = 5

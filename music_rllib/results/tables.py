@@ -377,12 +377,14 @@ def search_tables(search: Entry) -> Iterator[Table]:
         ],
     )
     for study in search["arms"]:
+        complete = sum(trial["state"] == "judged" for trial in study["trials"])
+        shares = study["importance"] if complete >= st.IMPORTANCE_TRIALS else None
         values = ", ".join(f"{name} = {_setting(value)}" for name, value in study["values"].items())
         yield Table(
             title=f"Importance of the settings{values and f' at {values}'}",
             note="Share of the objective's variance over the trials (functional ANOVA).",
             header=("Setting", "Share"),
-            rows=[(name, Share(share)) for name, share in (study["importance"] or {}).items()],
+            rows=[(name, Share(share)) for name, share in (shares or {}).items()],
         )
     yield Table(
         title="Trials",

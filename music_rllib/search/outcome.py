@@ -10,15 +10,13 @@ import optuna
 from optuna.trial import FrozenTrial, TrialState
 
 from music_rllib.redaction import redact
-from music_rllib.results.statistics import improvement
+from music_rllib.results.statistics import IMPORTANCE_TRIALS, improvement
 from music_rllib.search.controller import SearchController
 from music_rllib.search.objective import aggregate, interval
 from music_rllib.search.sampler import VALUES
 from music_rllib.search.searches import DATABASE_ERRORS, Finalist, Search
 from music_rllib.search.study import LOST, REASON, SCORES, OptunaStudy
 
-IMPORTANCE_TRIALS = 4
-"""Complete trials that an estimate of the settings' importance needs."""
 _STATES = {
     TrialState.COMPLETE: "judged",
     TrialState.PRUNED: "pruned",

@@ -25,6 +25,7 @@ from music_rllib.report.build import PAGE
 from music_rllib.results.archive import Format, read_archive, write_archive
 from music_rllib.results.data import Sweep
 from music_rllib.results.read import read_sweep
+from music_rllib.results.tables import search_tables
 from music_rllib.store.history import HISTORY, Report, RunResult, last_values, to_json_lines
 from music_rllib.sweep.listeners.state_file import StateFile
 from tests.processes import fresh, wait_until
@@ -49,6 +50,7 @@ stages:
 """
 Q = "tac.entropic_index"
 WORTH = {"name": "iqm of evaluation/success_rate", "direction": "maximize"}
+JUDGED = {"state": "judged", "values": {Q: 1.5}, "objective": [0.5], "reason": None}
 SEARCHES = [
     {
         "stage": "finetune",
@@ -61,6 +63,7 @@ SEARCHES = [
                 "values": {},
                 "importance": {Q: 0.9},
                 "trials": [
+                    *(JUDGED | {"number": number} for number in range(3, 12)),
                     {
                         "number": 0,
                         "state": "judged",
@@ -260,12 +263,22 @@ def test_the_page_shows_the_results_of_a_search(searched: Path, tmp_path: Path) 
     page = tmp_path / PAGE
     text = re.sub(r"<[^>]+>", "|", page.read_text().partition("Search of stage")[2])
     cells = [cell for cell in text.split("|") if cell.strip()]
-    assert "trials: 1 scored, 1 stopped early." in text
+    assert "trials: 10 scored, 1 stopped early." in text
     ranked = cells[cells.index("Probability that the best is better") + 1 :]
     assert ranked[:8] == ["1", "0", "1.25", "0.69", "0.50 to 0.75", "2", "0.81", "–"]
     assert "failed: no memory" in ranked
     assert ranked[ranked.index(Q) + 1] == "90%"
     assert "0.1 is not among the best &lt;2&gt;" in ranked
+    (search,) = read_archive(searched).searches
+    (arm,) = search["arms"]
+    fewer = {**search, "arms": [{**arm, "trials": arm["trials"][1:]}]}
+    titles = [
+        [table.title for table in search_tables(one) if table.rows] for one in (search, fewer)
+    ]
+    assert titles == [
+        ["Ranking on fresh seeds", "Importance of the settings", "Trials"],
+        ["Ranking on fresh seeds", "Trials"],
+    ]
 
 
 def test_the_report_of_an_export_has_the_same_tables(
