@@ -290,15 +290,17 @@ def _broken_final(stage: Stage, condition: Mapping[str, str]) -> str | None:
             "must not name what is tuned, as only the best trial has runs on fresh seeds: compare "
             f"its values by mode: compare in the search of {stage.name}, got {tuned[0]!r}"
         )
-    if search.final.trials == 1:
+    given = bool(search.points_to_evaluate) and search.final.baselines
+    if search.final.trials == 1 and not given:
         return None
     always = [name for name, dimension in search.space.items() if not dimension.when]
     if all(any(is_in(name, one) for name in condition) for one in always):
         return None
     return (
         f"must name every setting in the space of {stage.name}, or be about the best trial alone: "
-        "write final: {trials: 1}, and mode: compare with the values that are compared, "
-        f"got final.trials: {search.final.trials}"
+        f"write final: {{trials: 1{', baselines: false' * given}}}, and mode: compare with the "
+        f"values that are compared, got final.trials: {search.final.trials}"
+        f"{' and baselines: true' * given}"
     )
 
 

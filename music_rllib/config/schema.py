@@ -396,13 +396,19 @@ class SweepConfig:
         return next((one for one in self.stages if one.name == stage.source_stage), None)
 
     def stage(self, name: str | None = None) -> Stage:
-        """The stage with this name; without a name, the stage of the analysis, or the last one.
+        """The stage with this name; without a name, that of the analysis.
+
+        Without an analysis, it is the last stage that trains for the task, or the last one.
 
         Raises:
             BadInputError: The sweep has no such stage.
         """
         stages = {stage.name: stage for stage in self.stages}
-        name = name or (self.analysis and self.analysis.stage) or self.stages[-1].name
+        last = self.stages[-1].name
+        if self.analysis is None:
+            rewarded = (s.name for s in reversed(self.stages) if not s.variant.endswith("-u"))
+            last = next(rewarded, last)
+        name = name or (self.analysis and self.analysis.stage) or last
         if name not in stages:
             raise BadInputError(f"--stage must be one of {', '.join(stages)}, got {name!r}")
         return stages[name]

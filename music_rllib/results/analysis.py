@@ -218,7 +218,8 @@ def _final(sweep: Sweep, condition: Condition, metrics: Mapping[str, str]) -> Fi
         return None
     scores = np.array([[own[task] for task in metrics] for own in complete])
     is_rate = {*metrics.values()} <= names.EVAL_RATES
-    estimate = st.estimate(scores, sweep.episodes(condition.runs) if is_rate else None)
+    own_runs = [run for run in condition.runs if sweep.runs[run].task in metrics]
+    estimate = st.estimate(scores, sweep.episodes(own_runs) if is_rate else None)
     return FinalScores(condition=condition, scores=scores, estimate=estimate)
 
 

@@ -34,6 +34,7 @@ from music_rllib.limits import (
     read_json,
     read_regular,
 )
+from music_rllib.names import TAG_FAILURE
 from music_rllib.results.analysis_plan import PlanVersion, as_document, checked_plans
 from music_rllib.results.data import (
     Column,
@@ -79,7 +80,9 @@ _MAY_BE_EMPTY = ("started", "ended", "trained_seconds")
 _MAY_BE_MISSING = ("trained_seconds",)
 """Columns that old exports lack."""
 
-_PLACES = re.compile(r"^(?P<name> *(?:storage|tracking_uri): )(?P<place>.+)$", re.MULTILINE)
+_PLACES = re.compile(r"^( *(?:storage|tracking_uri): (['\"]?))(.+)(\2)$", re.MULTILINE)
+_FOLDERS = re.compile(r"(?:file://|(?<![\w:/.~]))/(?:[^\s/'\"]+/)+")
+"""The folders above a file in a message."""
 _LOCAL = re.compile(r"(sqlite(?:\+\w+)?:///)/(?:.*/)?([^/]+/[^/]+)|(?:file://)?/(?:.*/)?([^/]+)/*")
 
 
@@ -117,7 +120,7 @@ def write_archive(sweep: Sweep, folder: Path, file_format: Format = "parquet") -
     header["source"] = _without_folders(sweep.source)
     if sweep.config is not None:
         header["config"] = _PLACES.sub(
-            lambda found: found["name"] + _without_folders(found["place"]), sweep.config
+            lambda found: found[1] + _without_folders(found[3]) + found[4], sweep.config
         )
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -204,6 +207,7 @@ def _runs_table(runs: Sequence[RunRecord]) -> pa.Table:
         {"run": number}
         | {name: getattr(run, name) for name in _RUN_FIELDS}
         | {f"tag.{name}": value for name, value in run.tags.items()}
+        | ({f"tag.{TAG_FAILURE}": _FOLDERS.sub("", run.failure)} if run.failure else {})
         | {f"param.{name}": value for name, value in run.params.items()}
         for number, run in enumerate(runs)
     ]
@@ -382,11 +386,16 @@ def merged(earlier: Sweep, later: Sweep) -> Sweep:
 
 
 def plan_versions(sweeps: Iterable[Sweep]) -> tuple[PlanVersion, ...]:
-    """Each version of a plan once, without later ones for a subset of the seeds."""
+    """Each version of a plan once.
+
+    A version is left out if an earlier one of another storage contains it: one sweep was run in
+    parts. In one storage it is a change of the plan.
+    """
     kept: list[PlanVersion] = []
-    versions = (version for sweep in sweeps for version in sweep.plans)
-    for version in sorted(versions, key=lambda version: version.recorded_ms):
-        if not any(version.plan.is_part_of(earlier.plan) for earlier in kept):
+    versions = [(version, sweep.plans) for sweep in sweeps for version in sweep.plans]
+    for version, own in sorted(versions, key=lambda version: version[0].recorded_ms):
+        others = (earlier for earlier in kept if earlier not in own)
+        if version not in kept and not any(version.plan.is_part_of(one.plan) for one in others):
             kept.append(version)
     return tuple(kept)
 

@@ -109,8 +109,9 @@ def contrast(
         error = np.maximum(error, noise)
         scale = np.maximum(np.abs(x).max(axis=0), np.abs(y).max(axis=0))
         error = np.where(error > _TIED * scale, error, np.nan)
-        # Welch's degrees of freedom are unknown if neither side has a spread.
-        freedom = np.where(np.isnan(freedom), len(x) + len(y) - 2, freedom)
+        # Degrees of freedom are unknown without a spread.
+        without_spread = len(x) - 1 if paired else len(x) + len(y) - 2
+        freedom = np.where(np.isnan(freedom), without_spread, freedom)
 
     def p_greater(difference: Array) -> Array:
         """One-sided p-value of a mean difference of this size."""

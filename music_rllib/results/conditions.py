@@ -127,19 +127,19 @@ def find_stages(sweep: Sweep) -> list[StageRuns]:
     }
     by_key = {run.node_key: position for position, run in enumerate(sweep.runs)}
 
-    def varied_values(run: int) -> Values:
+    def varied_values(run: int, before: tuple[int, ...] = ()) -> Values:
         """Values that vary in the run's stage, and in the stage of the run that it starts from."""
         record = sweep.runs[run]
         own = tuple((n, settings[run][n]) for n in varying[record.stage] if n in settings[run])
         if part := record.tags.get(names.TAG_PART):
             own += ((SEEDS, FRESH if part.startswith("final") else SEARCHED),)
         source = by_key.get(record.tags.get(names.TAG_SOURCE_NODE, ""))
-        if source is None or source == run:
+        if source is None or source in (run, *before):  # a stranger's export can have a cycle
             return own
         stage = sweep.runs[source].stage
         of_source = (
             (name if ":" in name else f"{stage}: {name}", value)
-            for name, value in varied_values(source)
+            for name, value in varied_values(source, (run, *before))
         )
         return (*own, *of_source)
 
@@ -176,12 +176,30 @@ def _order(q: str, others: Values) -> tuple[object, ...]:
 
 
 def _varying(runs: Sequence[tuple[str, Mapping[str, str]]]) -> list[str]:
-    """Settings with more than one value on the same task, from (task, settings) pairs."""
+    """Settings with more than one value on the same task, from (task, settings) pairs.
+
+    A setting that is a number in one run and a mapping in another has no name in common.
+    """
     values: defaultdict[tuple[str, str], set[str]] = defaultdict(set)
+    forms: defaultdict[tuple[str, str], set[frozenset[str]]] = defaultdict(set)
     for task, settings in runs:
+        parts: defaultdict[str, list[str]] = defaultdict(list)
         for name, value in settings.items():
             values[task, name].add(value)
-    return sorted({name for (_, name), seen in values.items() if len(seen) > 1})
+            parts[_field(name)].append(name)
+        for field, own in parts.items():
+            forms[task, field].add(frozenset(own))
+    varying = {name for (_, name), seen in values.items() if len(seen) > 1}
+    for seen in forms.values():
+        if not frozenset.intersection(*seen):
+            varying |= frozenset.union(*seen)
+    return sorted(varying)
+
+
+@lru_cache(maxsize=1024)
+def _field(name: str) -> str:
+    """The field of a section that a param belongs to: `tac.behaviour` for `tac.behaviour.kind`."""
+    return ".".join(name.split(".")[:2])
 
 
 def _all_settings(records: Sequence[RunRecord]) -> list[dict[str, str]]:

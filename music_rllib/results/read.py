@@ -6,6 +6,7 @@ earlier versions of the plan are not read; a sentence names them.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -100,7 +101,7 @@ def read_stored(
         started=min((run.started for run in runs if run.started is not None), default=None),
         source=redact(opened.storage),
         tags=next((one.provenance for one in reversed(found) if one.provenance), {}),
-        config=yaml.safe_dump(configuration, sort_keys=False, allow_unicode=True),
+        config=yaml.safe_dump(configuration, sort_keys=False, allow_unicode=True, width=math.inf),
         runs=runs,
         history=columns(one.points for one in found),
         searches=searches_of(location, opened.config),

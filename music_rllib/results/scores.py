@@ -87,7 +87,7 @@ def measure_on(
     """The measure by which runs on a task are compared.
 
     A failed run has the worst score: 0 for a rate, the lowest possible return if the reward's range
-    is known, else the worst score of the compared runs.
+    is known, else the worst score of the runs of the compared stages.
 
     Args:
         runs: Positions of all runs that are compared.
@@ -104,7 +104,10 @@ def measure_on(
     )
     if not any(has_failed(sweep, run, measure.metric) for run in own):
         return measure
-    return replace(measure, worst=_worst(sweep, own, measure))
+    # The whole stage, so that a failed run has one score in all comparisons of a report.
+    stages = {sweep.runs[run].stage for run in own}
+    peers = [i for i, run in enumerate(sweep.runs) if run.task == task and run.stage in stages]
+    return replace(measure, worst=_worst(sweep, peers, measure))
 
 
 def has_failed(sweep: Sweep, run: int, metric: str | None = None) -> bool:
@@ -171,7 +174,7 @@ def _evaluations(sweep: Sweep, run: int, measure: Measure) -> tuple[Array, float
     steps, values = sweep.finite(run, measure.metric)
     whole = measure.kind != "final" and measure.horizon > 0
     episodes = sweep.final(run, names.EVAL_EPISODES)
-    used = values[steps <= measure.horizon] if whole else values[-1:]
+    used = values[steps <= max(measure.horizon, steps[0])] if whole else values[-1:]
     return used, np.inf if episodes is None else episodes
 
 
@@ -256,7 +259,8 @@ def with_pretraining(sweep: Sweep) -> Sweep:
         before, parts = 0, []
         for part in chain:
             own = column.of_run(part)
-            own = own.select(own.step <= budgets[part])
+            if part != chain[-1]:  # the last evaluation of a run can be after its budget
+                own = own.select(own.step <= budgets[part])
             parts.append(own._replace(run=0 * own.run + chain[-1], step=own.step + before))
             before += budgets[part]
         curve = joined(parts)

@@ -130,7 +130,7 @@ def to_csv(rows: Sequence[Mapping[str, object]]) -> str:
 def _plain(value: object) -> object:
     """`0 1 2` for a list, and `0:0.5 1:0.6` for a mapping."""
     if isinstance(value, Mapping):
-        return " ".join(f"{key}:{one:g}" for key, one in value.items())
+        return " ".join(f"{key}:{one!r}" for key, one in value.items())
     return " ".join(map(str, value)) if isinstance(value, list) else value
 
 

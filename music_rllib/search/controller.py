@@ -363,12 +363,13 @@ class SearchController(Listener):
             return []
         seeds = range(FINAL_SEED, FINAL_SEED + final.seeds)
         finalists: list[Finalist] = []
-        for trial in study.ranked():
+        # The given points are the study's first trials; they can be off the Pareto front.
+        given = len(search.settings.points_to_evaluate)
+        baselines = (trial for trial in study.complete() if trial.number < given)
+        for trial in (*study.ranked(), *baselines):
             values = study.point(trial)
             if any(finalist.values == values for finalist in finalists):
                 continue  # the same point twice is one finalist
-            # The given points are the study's first trials.
-            given = len(search.settings.points_to_evaluate)
             if len(finalists) >= final.trials and not (final.baselines and trial.number < given):
                 continue
             runs = self._plan_runs(search, study, trial, seeds, phase="final")

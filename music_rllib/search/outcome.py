@@ -105,7 +105,7 @@ def _importance(study: OptunaStudy) -> dict[str, float]:
 
     Empty if too few trials are complete, or if all have the same value.
     """
-    complete = [trial for trial in study.trials() if trial.state is TrialState.COMPLETE]
+    complete = study.complete()
     if len(complete) < IMPORTANCE_TRIALS or len({trial.values[0] for trial in complete}) < 2:
         return {}
     if all(len({str(t.params.get(name)) for t in complete}) < 2 for name in study.settings.space):

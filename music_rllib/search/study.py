@@ -150,9 +150,13 @@ class OptunaStudy:
         """A trial's point, with the compared values."""
         return {**self.compared, **trial.user_attrs[VALUES]}
 
+    def complete(self) -> list[FrozenTrial]:
+        """Complete trials in their order."""
+        return [trial for trial in self.trials() if trial.state is TrialState.COMPLETE]
+
     def ranked(self) -> list[FrozenTrial]:
         """Complete trials, the best first; of several objectives, only the Pareto front."""
-        complete = [trial for trial in self.trials() if trial.state is TrialState.COMPLETE]
+        complete = self.complete()
         signs = [1.0 if objective.maximised else -1.0 for objective in self.settings.objectives]
 
         def goodness(trial: FrozenTrial) -> tuple[float, ...]:

@@ -107,7 +107,10 @@ def stage_drawings(sweep: Sweep, analysis: StageAnalysis) -> Iterator[Drawing]:
     """The figures of one stage for which there is something to draw or to compare."""
     stage = _without_trials(sweep, analysis.stage)
     yield from _curves(sweep, stage, METRICS)
-    scopes = [replace(s, finals=s.compared) if s.compared else s for s in analysis.scopes]
+    scopes = [
+        replace(scope, finals=tuple(f for f in scope.finals if f.condition in stage.conditions))
+        for scope in analysis.scopes
+    ]
     scopes = [scope for scope in scopes if len(scope.finals) > 1]
     for metric, title in FINALS.items():
         if of_metric := [scope for scope in scopes if scope.metric == metric]:

@@ -22,6 +22,7 @@ Storage = Annotated[
 StageName = Annotated[
     str | None,
     typer.Option(
-        metavar="STAGE", help="Stage. Default: the stage of the analysis, or the last one."
+        metavar="STAGE",
+        help="Stage. Default: that of the analysis, or the last that trains for the task.",
     ),
 ]

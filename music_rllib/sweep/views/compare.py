@@ -27,7 +27,7 @@ def compare_stage(
     """The comparison of a stage's conditions as plain data, and as text with tables.
 
     Args:
-        stage: Name of the stage; None: the stage of the analysis, or the last one.
+        stage: Name of the stage; None: that of the analysis, or the last that trains for the task.
         metric: The compared metric; None: the objective's, or the primary one of each task.
         minimize: Lower values of the metric are better.
 

@@ -351,6 +351,10 @@ def test_baselines_are_ranked_with_the_best(tmp_path: Path) -> None:
     assert ranked == {0, 1, found["arms"][0]["best"]}
     runs = [run for run in driver.sweep.plan.runs if run.part.startswith("final")]
     assert len(runs) == 2 * len(ranked)
+    # Also off the Pareto front of several objectives.
+    objectives = [{}, {"read": "steps_to", "threshold": 0.5}]
+    several = searched(tmp_path / "several", search | {"objective": objectives})
+    assert {0, 1} <= {entry["trial"] for entry in several.outcome()["ranking"]}
 
 
 def test_importance_names_the_settings_that_matter(tmp_path: Path) -> None:

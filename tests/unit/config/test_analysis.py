@@ -131,6 +131,14 @@ UNTESTABLE: list[tuple[str, Document, str]] = [
     ("q = 2 better than q = 1", search(BEST, TUNED_Q), "must not name what is tuned"),
     ("q = 2, alpha = .1 better than q = 1", search(BEST), "got 'tac.alpha'"),
     (
+        "q = 2 better than q = 1",  # the pair of equal settings is that of the baselines
+        search(
+            {"final": {"trials": 1, "baselines": True}},
+            {"points_to_evaluate": [{"tac.alpha": 0.05}]},
+        ),
+        "write final: {trials: 1, baselines: false}, and mode: compare",
+    ),
+    (
         "q = 2, alpha = .3 better than q = 1",
         grid("tac", {"entropic_index": 2.0, "alpha": 0.1}, {"entropic_index": 1.0, "alpha": 0.3}),
         "must name values that a run of s has together, got tac.entropic_index = 2, tac.alpha = .3",

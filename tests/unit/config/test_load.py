@@ -236,6 +236,8 @@ def test_the_compared_stage_is_the_one_of_the_analysis(load: Callable[..., Sweep
         {"name": "other", "variant": "tac"},
     ]
     assert load(changed(stages=stages)).stage().name == "other"
+    explores = [stages[0], {"name": "explore", "variant": "music-u"}]
+    assert load(changed(stages=explores)).stage().name == "reach"
     analysis = {"hypotheses": ["q = 1.5 against q = 1"], "stage": "reach"}
     config = load(changed(stages=stages, analysis=analysis))
     assert config.stage().name == "reach"

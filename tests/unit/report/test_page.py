@@ -233,6 +233,9 @@ def test_figures_of_a_search_show_fresh_seeds_if_there_are_any() -> None:
 
     assert drawn(searched(*TRIALS)) == {f"q = {q}, seeds = search" for q in ("1", "1.2", "1.4")}
     assert drawn(searched(*TRIALS, *fresh)) == {f"q = {q}, seeds = fresh" for q in ("1", "1.2")}
+    waiting = [(one_run(q, 7, part="final1", status="SCHEDULED"), Points()) for q in ("1", "1.2")]
+    trials = [(one_run(q, seed, part=part), climbing(end)) for q, seed, part, end in TRIALS]
+    assert "FetchPush" in render(build_report(sweep_of([*trials, *waiting])))
 
 
 def test_final_entropies_are_in_a_table_and_a_figure() -> None:
@@ -326,6 +329,18 @@ def test_only_seeds_that_finished_on_every_task_count_over_all_tasks() -> None:
     assert push.finals[0].seeds == 2
 
 
+def test_the_interval_of_a_task_is_that_of_its_own_episodes() -> None:
+    runs = []
+    for task, episodes in (("FetchPush", 100.0), ("FetchSlide", 5.0)):
+        points = Points(
+            [names.EVAL_SUCCESS, names.EVAL_EPISODES], [9] * 2, [9] * 2, [1.0, episodes]
+        )
+        runs += [(one_run("1", seed, task=task), points) for seed in range(5)]
+    _, *scopes = analyse(sweep_of(runs))[0].scopes
+    lower = [float(scope.finals[0].estimate.lower) for scope in scopes]
+    assert lower == pytest.approx([0.025 ** (1 / 500), 0.025 ** (1 / 25)])
+
+
 # Conditions ---------------------------------------------------------------------------------------
 
 
@@ -358,6 +373,24 @@ def test_conditions_differ_in_settings_and_in_their_source() -> None:
         "q = 1.5, tac.lr = 0.001, pretrain: q = 1",
         "q = 1.5, tac.lr = 0.001, pretrain: q = 2",
     ]
+
+
+def test_a_number_and_a_mapping_are_different_conditions() -> None:
+    weights = {"intrinsic.weight": "0.5"}, {"intrinsic.weight.start": "0.5"}
+    runs = [one_run("1", seed, params=params) for params in weights for seed in (0, 1)]
+    assert labels(sweep_of([(run, climbing(0.5)) for run in runs])) == [
+        "q = 1, intrinsic.weight = 0.5",
+        "q = 1, intrinsic.weight.start = 0.5",
+    ]
+
+
+def test_runs_that_start_from_each_other_have_a_page() -> None:
+    cycle = []
+    for own, source in ("ab", "ba"):
+        run = one_run("1", 0, stage=own)
+        tags = {names.TAG_NODE_KEY: own, names.TAG_SOURCE_NODE: source}
+        cycle.append((replace(run, tags={**run.tags, **tags}), climbing(0.5)))
+    assert "Stage a" in render(build_report(sweep_of(cycle)))
 
 
 def test_schedules_with_the_same_label_are_different_conditions() -> None:
@@ -618,7 +651,7 @@ def test_stages_that_train_for_the_task_share_a_figure() -> None:
     assert colors[0] == colors[2] != colors[1] == colors[3]
     assert len(set(named)) == 4, "stages have lines of their own"
     page = render(report)
-    assert f'id="{drawing.name}"' in page
+    assert f'id="subplots-{drawing.name}"' in page
     for one in (of_stages("pretrain", "plain"), of_stages("plain")):
         assert SIDE_BY_SIDE not in {drawing.stage for drawing in build_report(one).drawings}
 

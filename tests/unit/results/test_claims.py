@@ -159,6 +159,10 @@ def test_tied_seeds_are_as_uncertain_as_their_episodes() -> None:
     assert tied.p_equivalent is not None
     assert near.p_equivalent is not None
     assert float(tied.p_equivalent) < float(near.p_equivalent) < 0.05
+    almost = c.contrast(
+        np.append(ones[1:], 1 + 1e-9), ones, paired=True, margin=MARGIN, noise=noise
+    )
+    assert float(tied.p_equivalent) == pytest.approx(almost.p_equivalent)
     # Without episodes their uncertainty is unknown.
     assert not c.contrast(ones, 0 * ones, paired=True).difference.has_interval
 

@@ -134,8 +134,17 @@ def test_the_last_of_several_values_at_a_step_counts() -> None:
 def test_an_export_has_no_absolute_paths(tmp_path: Path) -> None:
     config = "storage: /home/anna/r\nstages:\n- search:\n    storage: sqlite:////home/anna/x/s.db\n"
     config += "mlflow:\n  tracking_uri: sqlite:////home/anna/y/mlflow.db\n"
-    write_archive(replace(read_archive(EXPORT), config=config), tmp_path)
+    config += "quoted:\n  storage: '/home/anna: x/results'\n"
+    sweep = read_archive(EXPORT)
+    failure = {names.TAG_FAILURE: "no module 'x' (it is not in /home/anna/x, see s3://b/c/d)"}
+    failed = replace(sweep.runs[0], tags={**sweep.runs[0].tags, **failure})
+    sweep = replace(sweep, runs=[failed, *sweep.runs[1:]])
+    write_archive(replace(sweep, config=config), tmp_path)
     assert "anna" not in (tmp_path / "sweep.json").read_text()
+    kept = read_archive(tmp_path)
+    assert kept.runs[0].failure == "no module 'x' (it is not in x, see s3://b/c/d)"
+    assert kept.config is not None
+    assert "  storage: 'results'\n" in kept.config
 
 
 def test_an_export_on_a_full_disk_keeps_the_earlier_one(

@@ -90,6 +90,9 @@ def test_a_later_plan_for_fewer_seeds_is_not_another_version() -> None:
     # Additional seeds are a new version.
     early, late = recorded(1, "0, 1"), recorded(2, "0, 1, 2")
     assert merged(early, late).plans == (*early.plans, *late.plans)
+    # Fewer seeds in the same storage are a change of the plan.
+    changed = replace(whole, plans=(*whole.plans, *recorded(2, "0, 1").plans))
+    assert merged(whole, changed).plans == merged(changed, changed).plans == changed.plans
 
 
 def test_runs_of_a_plan_are_found_in_exports_of_other_sweeps(tmp_path: Path) -> None:

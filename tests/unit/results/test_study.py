@@ -644,6 +644,23 @@ def test_a_failed_run_has_the_smallest_return_or_the_worst_observed(
     assert len(mean.scores.by_seed) == 7
 
 
+def test_a_failed_run_has_one_score_in_a_report() -> None:
+    """Without a range of rewards, it is the worst of the stage, also in a comparison of two q."""
+    runs = []
+    for q, level in (("1", -10.0), ("1.5", -9.0), ("2", -90.0)):
+        for seed in range(5):
+            record, _ = run({"tac.entropic_index": q}, seed, 0.3, np.random.default_rng(0))
+            params = {**record.params, "task.success_key": "None"}
+            status = "FAILED" if (q, seed) == ("1.5", 0) else "FINISHED"
+            points = Points([names.EVAL_RETURN] * 2, [0, BUDGET], [DONE] * 2, [level] * 2)
+            runs.append((replace(record, params=params, status=status), points))
+    found = study_of(sweep_of(runs, BEFORE))
+    means = {mean.condition.entropic_index: float(mean.estimate.value) for mean in found.means}
+    assert means["1.5"] == pytest.approx((-90 - 4 * 9) / 5)
+    (claim,) = found.planned
+    assert float(claim.contrast.difference.value) == pytest.approx(means["1.5"] - means["1"])
+
+
 def test_three_seeds_have_an_interval_but_no_verdict(
     rng: np.random.Generator,
 ) -> None:
@@ -844,3 +861,15 @@ def test_auc_total_counts_the_steps_of_pretraining(rng: np.random.Generator) -> 
     whole = claims["auc_total"]
     assert float(whole.contrast.difference.value) == pytest.approx(-0.15, abs=0.03)
     assert whole.measure.words == "mean success over 20,000 steps, pretraining included"
+    # A round of whole episodes can end after the budget.
+    late = [
+        (
+            record,
+            points._replace(
+                steps=[s + 30 * (s >= int(record.params["env_steps"])) for s in points.steps]
+            ),
+        )
+        for record, points in runs
+    ]
+    (claim,) = study_of(sweep_of(late, with_plan((), planned, 5))).planned
+    assert float(claim.contrast.difference.value) == pytest.approx(-0.15, abs=0.03)
