@@ -228,10 +228,12 @@ class RunSettings(StrictModel):
     @property
     def architecture(self) -> Architecture:
         """Settings that determine the shapes or the meaning of the networks' arrays."""
+        default = 1 if self.tac.policy == "deterministic" else 2
         return Architecture(
             hidden_sizes=self.tac.hidden_sizes,
             layer_norm=self.tac.layer_norm,
-            critics=self.tac.critics,
+            # Handoffs without this setting have the default.
+            critics=None if self.tac.critic_count == default else self.tac.critic_count,
             quantiles=self.tac.quantiles,
             policy=self.tac.policy,
             bootstrap=self.tac.bootstrap,
@@ -304,9 +306,11 @@ class RunSettings(StrictModel):
         if self.intrinsic.frozen != (frozen := variant_intrinsic(self.variant)["frozen"]):
             rule = contradiction(self.variant, frozen, self.intrinsic.frozen)
             raise ValueError(f"intrinsic.frozen {rule}")
-        if rules.uses_mi and not self.task.has_split:
+        moves = "intrinsic.reward displacement" * (self.intrinsic.reward == "displacement")
+        if (rules.uses_mi or moves) and not self.task.has_split:
             raise ValueError(
-                f"task must have agent_indices and surrounding_indices for {self.variant}, "
+                "task must have agent_indices and surrounding_indices for "
+                f"{moves or self.variant}, "
                 f"got {self.task.name!r}, which has none"
             )
         return self

@@ -52,13 +52,14 @@ _SIMILAR = 0.85
 class Question(BaseModel):
     """A task, and what its runs use.
 
-    That is the values of `replay.hindsight_episodes` of those with hindsight, and whether one has
-    MUSIC's or another intrinsic reward.
+    That is the values of `replay.hindsight_episodes` of those with hindsight, whether one has
+    MUSIC's or another intrinsic reward, and the names of the others.
     """
 
     task: Task
     hindsight: tuple[str, ...] = ()
     intrinsic: bool = False
+    rewards: tuple[str, ...] = ()
 
 
 class RefusedError(Exception):
@@ -73,7 +74,7 @@ class Probe:
 
     def __init__(self, question: Question, watch: Callable[[str], None]) -> None:
         self._task, self._hindsight, self._watch = question.task, question.hindsight, watch
-        self._intrinsic = question.intrinsic
+        self._intrinsic, self._rewards = question.intrinsic, question.rewards
         self.problems: list[str] = []
         """Reasons to refuse the task."""
         self.remarks: list[str] = []
@@ -132,6 +133,13 @@ class Probe:
                 "must have goals for replay.hindsight_k > 0, its observations have none; "
                 "replay: {hindsight_k: 0} turns hindsight off, which some presets turn on"
             )
+        least = {"diayn": 2, "discern": 1}
+        self.problems += [
+            f"must have goals of {least[name]} dimensions or more for intrinsic.reward {name}, "
+            f"they have {goal}"
+            for name in self._rewards
+            if goal < least.get(name, 0)
+        ]
         smallest, largest = task.seed_range
         self._try_seeds(env, smallest, largest)
         first = self._play(env, largest, actions=0)

@@ -35,6 +35,8 @@ SETTINGS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     }
 )
 """Keyword arguments of these classes, which are numbers; reading them there would load PyTorch."""
+COUNTS: Mapping[str, int] = MappingProxyType({"hidden": 1, "features": 1, "models": 2, "skills": 2})
+"""Those that are whole numbers, and their smallest values."""
 OF_GOALS = frozenset({"diayn", "discern"})
 """Rewards that are constant if all goals are equal."""
 
@@ -76,6 +78,13 @@ class IntrinsicSettings(StrictModel):
                     )
                 if isinstance(value, bool) or not isinstance(value, int | float) or value <= 0:
                     raise ValueError(f"settings.{name} must be a number > 0, got {value!r}")
+                if name in COUNTS:
+                    least = COUNTS[name]
+                    if value < least or value != int(value):
+                        raise ValueError(
+                            f"settings.{name} must be a whole number >= {least}, got {value!r}"
+                        )
+                    self.settings[name] = int(value)  # 1e2 is 100
         return self
 
     @property

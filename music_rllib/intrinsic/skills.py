@@ -51,6 +51,11 @@ class DIAYN(_OfGoals):
 
     def __init__(self, sizes: Sizes, *, skills: int = 8, hidden: int = 64) -> None:
         super().__init__(sizes)
+        if sizes.goal == 1:
+            raise ValueError(
+                "intrinsic.reward must not be diayn with goals of one dimension, which have two "
+                "directions"
+            )
         if skills < 2:
             raise ValueError(f"intrinsic.settings.skills must be >= 2, got {skills}")
         directions = normalize(torch.randn(skills, sizes.goal), dim=-1)

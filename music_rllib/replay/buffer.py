@@ -252,6 +252,9 @@ class TrajectoryReplay(TrajectoryRing):
         drawn.rewards[rows] += self._gamma**ahead * rewards
         drawn.discounts[rows] = self._gamma**ahead * discounts
         drawn.next_inputs[rows, :observation] = both[:, after : after + observation]
+        # The environment can change its goal during an episode; a new one stays.
+        own = both[~new, after + observation : after + self.layout.network_input]
+        drawn.next_inputs[rows[~new], observation:] = own
 
     def update_priorities(self, rows: Rows, errors: Floats) -> None:
         """PER: set the priorities of `rows` [B] by their absolute TD errors [B]."""

@@ -67,6 +67,8 @@ def check_environments(plan: Plan, hang_minutes: float | None = None) -> list[st
         if run.replay.hindsight_k > 0:
             episodes = {*question.hindsight, run.replay.hindsight_episodes}
             question.hindsight = tuple(sorted(episodes))
+        if run.intrinsic.reward is not None:
+            question.rewards = tuple(sorted({*question.rewards, run.intrinsic.reward}))
         question.intrinsic |= run.music.estimator != "none" or run.intrinsic.reward is not None
     problems, remarks = [], []
     while left:  # the child process ends early at an environment that ends it

@@ -456,6 +456,21 @@ BAD: list[tuple[Document, str]] = [
         with_stage(0, intrinsic={"reward": "e3b", "settings": {"ridge": 0}}),
         "settings.ridge must be a number > 0, got 0",
     ),
+    (
+        with_stage(0, intrinsic={"reward": "rnd", "settings": {"hidden": 2.5}}),
+        "settings.hidden must be a whole number >= 1, got 2.5",
+    ),
+    (
+        with_stage(0, intrinsic={"reward": "disagreement", "settings": {"models": 1}}),
+        "settings.models must be a whole number >= 2, got 1",
+    ),
+    (
+        changed(
+            tasks=["FetchReach"],
+            stages=[{"name": "a", "variant": "tac", "intrinsic": {"reward": "displacement"}}],
+        ),
+        "must have agent_indices and surrounding_indices for intrinsic.reward displacement",
+    ),
     (with_stage(0, intrinsic={"weight": -1.0}), "intrinsic.weight must be >= 0, got -1"),
     (with_stage(0, intrinsic={"frozen": True}), "intrinsic.frozen must be false for music-u, got"),
     (
@@ -571,8 +586,9 @@ def test_policies_need_the_same_networks_on_both_sides(
         lines = problems(changed(stages=stages))
         named = [line.split("needs the same tac.")[1].split(" in stage")[0] for line in lines]
         assert named == wrong
-    stages[0]["tac"], stages[1]["tac"] = {}, {"log_std_bounds": [-5.0, 2.0]}
-    load(changed(stages=stages))
+    for same in ({"log_std_bounds": [-5.0, 2.0]}, {"critics": 2}):  # without an effect
+        stages[0]["tac"], stages[1]["tac"] = {}, same
+        load(changed(stages=stages))
 
 
 def test_an_intrinsic_reward_is_pretrained_frozen_and_handed_over(

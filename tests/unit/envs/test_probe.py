@@ -45,6 +45,7 @@ def probed(
     *,
     hindsight: bool = False,
     intrinsic: bool = False,
+    rewards: tuple[str, ...] = (),
     **task: Any,
 ) -> Probe:
     monkeypatch.setattr(probe, "MOST_STEPS", 3000)
@@ -54,7 +55,9 @@ def probed(
     gym.register(name, entry_point=lambda **_: kind(), max_episode_steps=20)
     try:
         declared = Task(name="T", env_id=name, horizon=20, **task)
-        asked = Question(task=declared, hindsight=("all",) * hindsight, intrinsic=intrinsic)
+        asked = Question(
+            task=declared, hindsight=("all",) * hindsight, intrinsic=intrinsic, rewards=rewards
+        )
         made = Probe(asked, lambda call: None)
         made.run()
     finally:
@@ -70,6 +73,22 @@ def changed(step: Callable[..., Any]) -> type[Sound]:
             return step(self, *super().step(action))
 
     return Changed
+
+
+def test_rewards_about_goals_need_goals(monkeypatch: pytest.MonkeyPatch) -> None:
+    class OneGoal(Sound):
+        goals: ClassVar = {
+            name: spaces.Box(-9, 9, (1,)) for name in ("achieved_goal", "desired_goal")
+        }
+        observation_space = spaces.Dict({"observation": spaces.Box(-9, 9, (2,)), **goals})
+
+        def seen(self) -> Any:
+            found = super().seen()
+            return {name: found[name][:1] if "goal" in name else found[name] for name in found}
+
+    made = probed(monkeypatch, OneGoal, rewards=("diayn", "discern", "rnd"))
+    (line,) = made.problems
+    assert line.startswith("must have goals of 2 dimensions or more for intrinsic.reward diayn")
 
 
 def test_a_sound_environment_has_no_problems_or_remarks(monkeypatch: pytest.MonkeyPatch) -> None:

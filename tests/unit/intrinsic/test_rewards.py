@@ -220,7 +220,6 @@ def test_frozen_rewards_keep_the_networks_and_the_scale_of_their_source(name: st
         (f"{__name__}:batch", {}, "must name a subclass of IntrinsicReward"),
         (f"{__name__}:IntrinsicReward", {}, "must have a method bonus, which .* lacks"),
         (f"{__name__}:Speed", {"facter": 3}, r"^intrinsic\.settings must fit .*Speed: .*facter"),
-        ("diayn", {"skills": 1}, r"^intrinsic\.settings\.skills must be >= 2, got 1"),
     ],
 )
 def test_what_does_not_fit_is_named(name: str, settings: Any, message: str) -> None:

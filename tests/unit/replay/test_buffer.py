@@ -145,6 +145,19 @@ def test_n_steps_add_the_rewards_of_the_relabeled_goal_up_to_the_end(
         np.testing.assert_array_equal(batch.actions[row], [number, step])
 
 
+def test_n_steps_end_with_the_goal_of_their_last_state() -> None:
+    """Of an environment whose desired goal changes during an episode."""
+    buffer = replay(100, n_steps=3, gamma=0.5)
+    moving = episode(0, 5)
+    moving.frames[:, 3] = 200 + np.arange(6)
+    buffer.extend([moving])
+    batch = buffer.sample_transitions(200)
+    for transition, following in zip(batch.inputs, batch.next_inputs, strict=True):
+        assert transition[3] == 200 + transition[1]
+        assert following[1] == min(transition[1] + 3, 5)
+        assert following[3] == 200 + following[1]
+
+
 @pytest.mark.parametrize("n_steps", [1, 3])
 def test_relabeled_transitions_end_where_their_new_goal_is_reached(n_steps: int) -> None:
     """Episodes that end at their goal, at another state (a fall), or by their length."""
