@@ -30,6 +30,7 @@ from music_rllib.config.search import FINAL_SEED
 from music_rllib.config.stages import resolve_stage
 from music_rllib.envs.tasks import BUILT_IN_TASKS, Task, closest, search_in
 from music_rllib.limits import MOST_RUNS, MOST_SEEDS
+from music_rllib.redaction import without_secrets
 from music_rllib.store.storage import expanded
 
 
@@ -135,9 +136,31 @@ def _parsed_seeds(text: str, given: Any) -> list[float]:
     return [*known, *itertools.islice(others, max(int(text) - len(known), 0))][: int(text)]
 
 
+_OF_RUNS = ("env_kwargs", "settings", "space", "compare", "grid")
+"""Mappings whose keys the user chooses and that decide what is trained."""
+
+
+def _check_recorded(value: Any, findings: Findings) -> None:
+    """Add a problem for each setting of runs that the record of a sweep would hide as a secret.
+
+    `resume`, which reads the record, would train something else.
+    """
+    pairs = value.items() if isinstance(value, dict) else enumerate(_list(value))
+    for key, inner in pairs:
+        if key not in _OF_RUNS or not isinstance(inner, dict):
+            _check_recorded(inner, findings.below(key))
+            continue
+        kept = without_secrets(inner)
+        for name in inner:
+            if kept.get(str(name), None if inner[name] is not None else 0) != inner[name]:
+                rule = "must have another name or value: this one looks like a secret, which is"
+                findings.add((key, name), f"{rule} not recorded for `resume`")
+
+
 def _resolve(document: Document, findings: Findings) -> SweepConfig | None:
     """The sweep; None if there are problems, which are added to `findings`."""
     data = document.data
+    _check_recorded(data, findings)
     registry = _registry(data, findings)
     header = _header(data, findings)
     defaults = _mapping(data.get("defaults"))

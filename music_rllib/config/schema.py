@@ -23,7 +23,7 @@ from music_rllib.schedules import StrictModel
 from music_rllib.store.handoff import HandoffManifest
 
 RESERVED_NAMES = frozenset(
-    {"nodes", "work", "continuations", "verified.json"}
+    {"nodes", "work", "continuations", "verified.json", "environments.json"}
     | {"mlartifacts", "mlflow.db", "mlflow.db.lock"}
 )
 """Entries of a storage folder that are not sweeps' folders."""

@@ -287,7 +287,7 @@ def _found_run(sweep: OpenSweep, node: Mapping[str, Any]) -> FoundRun | None:
     key, continuation, store = node["key"], node.get("continuation"), sweep.store
     progress = sweep.progress(key)
     if progress == FINISHED:
-        environment = store.environment(key)
+        environment = None if key in sweep.damaged else store.environment(key)
     elif progress is not None:
         environment = store.work_folder(key).environment()
     elif sweep.scheduler.knows(key) and continuation is not None:

@@ -29,6 +29,7 @@ from music_rllib.names import in_runs
 from music_rllib.redaction import redact, without_secrets
 from music_rllib.store.node_store import NodeStore
 from music_rllib.store.storage import StorageError, database_url
+from music_rllib.store.work_folder import steps_of
 
 # Writing the record -------------------------------------------------------------------------------
 
@@ -40,7 +41,7 @@ def keep_record(sweep: OpenSweep) -> None:
         StorageError: The folder can't be written.
     """
     location = sweep.location
-    configuration = as_json(_configuration(sweep.config))
+    configuration = as_json(configuration_of(sweep.config))
     unchanged = _unchanged_plan(sweep, configuration)
     with contextlib.suppress(StorageError):  # a damaged record is replaced
         sweep.earlier[:] = unchanged["earlier"] if unchanged else _earlier_runs(sweep)
@@ -71,7 +72,7 @@ def plan_document(sweep: OpenSweep) -> dict[str, Any]:
     }
 
 
-def _configuration(config: SweepConfig) -> dict[str, Any]:
+def configuration_of(config: SweepConfig) -> dict[str, Any]:
     """The whole configuration without secrets, in a form that is valid on every machine."""
     document: dict[str, Any] = json.loads(as_json(without_secrets(config.document)))
     if uri := (document.get("mlflow") or {}).get("tracking_uri"):
@@ -100,7 +101,7 @@ def _earlier_runs(sweep: OpenSweep) -> list[dict[str, Any]]:
     recorded = sweep.location.read(PLAN) or {"nodes": []}
     known = {one["key"]: one for one in (*recorded["nodes"], *recorded.get("earlier", ()))}
     gone = known.keys() - {node.key for node in sweep.plan.nodes}
-    kept = ("key", "label", "continuation")
+    kept = ("key", "label", "input", "continuation")
     earlier = (one for key, one in known.items() if key in gone)
     return [{name: one[name] for name in kept if name in one} for one in earlier]
 
@@ -167,7 +168,8 @@ def changes_since(sweep: OpenSweep) -> Changes | None:
             and old["input"] == node.source_key
             and old["env_steps"] < node.run.env_steps
         )
-        if is_longer and sweep.continued_from(node) is not None:
+        continued = sweep.continued_from(node) if is_longer else None
+        if continued is not None and _checkpointed(sweep, old["key"]) <= continued:
             continue
         counts.update(lines)
         if (progress := sweep.progress(old["key"])) is not None:
@@ -191,6 +193,12 @@ def changes_since(sweep: OpenSweep) -> Changes | None:
         differences=tuple(differences or ["the runs that it starts from"]),
         lost=tuple(lost),
     )
+
+
+def _checkpointed(sweep: OpenSweep, key: str) -> int:
+    """Environment steps of the last checkpoint of an unfinished run; 0 without one."""
+    checkpoints = [] if sweep.store.is_finished(key) else sweep.store.work_folder(key).names()
+    return steps_of(checkpoints[-1]) if checkpoints else 0
 
 
 def _last_configuration(sweep: OpenSweep) -> SweepConfig | None:

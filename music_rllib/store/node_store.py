@@ -90,10 +90,12 @@ class NodeStore(SealedFolders):
     def lines(self, key: str) -> tuple[bytes, dict[str, str], Fingerprint | None]:
         """The `HISTORY` of a finished run, and its code and environment as passed to `publish`."""
         manifest = self.manifest(key)
-        known = manifest.meta.get("provenance")
-        provenance = known.items() if isinstance(known, dict) else ()
         lines = self.read(key, HISTORY, manifest)
-        return lines, {k: str(value) for k, value in provenance}, environment_of(manifest)
+        return lines, _provenance(manifest), environment_of(manifest)
+
+    def provenance(self, key: str) -> dict[str, str]:
+        """Tags that name the code of a finished run, as passed to `publish`."""
+        return _provenance(self.manifest(key))
 
     def publish(
         self,
@@ -250,3 +252,8 @@ def damage_in_words(damage: Mapping[str, DamagedError]) -> str:
     lines = indented([f"{label}: {error}" for label, error in damage.items()])
     what = "1 finished run is" if len(damage) == 1 else f"{len(damage)} finished runs are"
     return "\n".join((f"{what} damaged; {TRAIN_AGAIN}:", *lines))
+
+
+def _provenance(manifest: Manifest) -> dict[str, str]:
+    known = manifest.meta.get("provenance")
+    return {k: str(value) for k, value in known.items()} if isinstance(known, dict) else {}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,7 +15,7 @@ from music_rllib.experiment import sweep_files
 from music_rllib.experiment.sweep_files import SweepLocation, sweeps_in
 from music_rllib.redaction import redact
 from music_rllib.store.lease import Lease, LeaseFile
-from music_rllib.store.node_store import CONTINUATIONS
+from music_rllib.store.node_store import CONTINUATIONS, NodeStore
 from music_rllib.store.sealed import MANIFEST
 from music_rllib.store.storage import (
     StorageError,
@@ -126,6 +126,7 @@ def find_deletable(location: SweepLocation, *, unfinished: bool, everything: boo
                 cleaning.leases[work.folder.path] = work.lease
                 cleaning.add(work.folder, f"checkpoints of {label}: {why}")
         if key in finished and (last := node.get("continuation")) in continued:
+            continued.remove(last)  # several runs can have it
             folder, what = storage / CONTINUATIONS / last, f"last checkpoint of {label}"
             if last in users:
                 cleaning.keep(folder.path, f"{what}: {', '.join(users[last])} has it too")
@@ -163,7 +164,7 @@ def _nodes(location: SweepLocation) -> list[dict[str, Any]]:
     return [
         *nodes,
         *({"key": key, "label": f"{key} (imported)", "input": None} for key in imported),
-        *({**one, "label": f"{one['label']} (earlier version)", "input": None} for one in earlier),
+        *({"input": None, **one, "label": f"{one['label']} (earlier version)"} for one in earlier),
     ]
 
 
@@ -183,6 +184,33 @@ def check_not_in_use(location: SweepLocation, keys: Collection[str]) -> None:
                 "--retrain and --accept-changes must delete no runs of another running sweep, "
                 f"{other.name} uses {shared[0]}: stop it first"
             )
+
+
+def started_from(location: SweepLocation, keys: Collection[str]) -> list[Mapping[str, Any]]:
+    """Runs of all sweeps in the storage, and of their earlier plans, that start from these runs."""
+    nodes: dict[str, Mapping[str, Any]] = {}
+    for sweep in sweeps_in(location.storage):
+        with contextlib.suppress(StorageError):
+            own = ({**node, "label": f"{sweep.name}: {node['label']}"} for node in _nodes(sweep))
+            nodes |= {node["key"]: node for node in own}
+    found = set(keys)
+    while more := {key for key, node in nodes.items() if node["input"] in found} - found:
+        found |= more
+    return [nodes[key] for key in sorted(found - set(keys))]
+
+
+def remove_started(
+    store: NodeStore, nodes: Iterable[Mapping[str, Any]], say: Callable[[str], None]
+) -> None:
+    """Delete results and checkpoints of runs that start from a run to be retrained."""
+    begun = store.begun()
+    for node in nodes:
+        if node["key"] in begun or store.is_finished(node["key"]):
+            say(f"{node['label']}: deleted, it starts from a run to be retrained")
+            store.remove(node["key"])
+            store.work_folder(node["key"]).clear()
+        if "continuation" in node:
+            store.continuation(node["continuation"]).clear()
 
 
 def _users(location: SweepLocation, nodes: Iterable[Mapping[str, Any]]) -> dict[str, list[str]]:

@@ -132,6 +132,7 @@ def run(
 
     console = console_for(as_json=as_json, unfailing=True)
     warn = partial(_say, console, style="yellow")
+    has_begun = False
     try:
         opened, _ = _open(console, config, lenient=retrain_damaged, wait_minutes=wait_minutes)
         changes = _changes(opened)
@@ -147,20 +148,27 @@ def run(
             early,
         ):
             with alone(opened.location, partial(_say, console)):
-                if opened.damaged or again:
+                if opened.damaged or again or changes is not None:
                     drivers.check_alone()
+                started = []
                 if again:
-                    from music_rllib.sweep.clean import check_not_in_use
+                    from music_rllib.sweep import clean
 
-                    check_not_in_use(opened.location, [run.key for run in again])
+                    keys = [run.key for run in again]
+                    started = clean.started_from(opened.location, keys)
+                    keys += [node["key"] for node in started]
+                    clean.check_not_in_use(opened.location, keys)
                 opened = reopened(opened)  # another command may have deleted runs
                 remove_damaged(opened, warn)
                 opened = accept_environments(remove_runs(opened, again, warn), kept, warn)
+                if started:
+                    clean.remove_started(opened.store, started, warn)
                 _check(opened)
                 tracker = stack.enter_context(open_tracker(opened))
                 for retrained in again:
                     tracker.forget(retrained.key)
                 keep_record(opened)
+                has_begun = True  # what is to be retrained is recorded
                 plans = _record_analysis_plan(console, opened)
                 shares = bool(drivers.others())
             code = compute_and_report(
@@ -169,7 +177,7 @@ def run(
         if as_json:
             print_json(opened.location.read(STATE) or {})
     except (KeyboardInterrupt, SystemExit) as stopped:
-        return _stopped_early(console, stopped)
+        return _stopped_early(console, stopped, has_begun=has_begun)
     finally:
         be_patient(0.0)
     return code
@@ -276,13 +284,15 @@ def _measure(console: Console, opened: OpenSweep) -> dict[str, Any]:
     return measured
 
 
-def _stopped_early(console: Console, stopped: KeyboardInterrupt | SystemExit) -> int:
+def _stopped_early(
+    console: Console, stopped: KeyboardInterrupt | SystemExit, *, has_begun: bool = False
+) -> int:
     """The exit code for a signal that came while nothing was trained; raises other causes."""
     if not is_stop(stopped):
         raise stopped
     by_ray = isinstance(stopped, SystemExit)
     number = signal.SIGTERM if by_ray else early.received or signal.SIGINT
-    _say(console, how_to_continue(has_begun=False))
+    _say(console, how_to_continue(has_begun=has_begun))
     return 128 + number
 
 

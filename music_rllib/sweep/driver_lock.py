@@ -12,9 +12,10 @@ import contextlib
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 from music_rllib.errors import BadInputError
-from music_rllib.experiment.sweep_files import SweepLocation
+from music_rllib.experiment.sweep_files import STOP, SweepLocation
 from music_rllib.store.lease import HeldLease, Lease, LeaseFile
 
 FILE, DRIVERS = "driver.json", "drivers"
@@ -39,6 +40,8 @@ class Drivers:
     location: SweepLocation
     owner: str
     """Owner of this driver's lease."""
+    stop_before: Any
+    """The request to stop that was there before this driver."""
 
     def others(self, *, watch: bool = False) -> list[Lease]:
         """The leases of all other drivers."""
@@ -53,9 +56,9 @@ class Drivers:
         """
         if others := self.others(watch=True):
             raise BadInputError(
-                "--retrain, --retrain-damaged and --accept-changes delete results and must be "
-                f"given while no other process runs {self.location.name}, got {others[0]}: stop "
-                "it first"
+                "--retrain, --retrain-damaged and --accept-changes delete results or change the "
+                f"plan and must be given while no other process runs {self.location.name}, got "
+                f"{others[0]}: stop it first"
             )
 
 
@@ -90,9 +93,10 @@ def driving(location: SweepLocation) -> Iterator[Drivers]:
     """
     lease = Lease.of_this_process(f"sweep {location.name!r}")
     file = LeaseFile(location.files / DRIVERS, f"{lease.owner}.json")
+    stop_before = location.read(STOP)
     file.acquire(lease)
     held = HeldLease(file, lease)
     try:
-        yield Drivers(location, lease.owner)
+        yield Drivers(location, lease.owner, stop_before)
     finally:
         held.release()

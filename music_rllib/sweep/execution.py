@@ -19,6 +19,7 @@ from music_rllib.command_line import how_to_continue
 from music_rllib.errors import FAILED
 from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.plan import Node
+from music_rllib.experiment.record import configuration_of
 from music_rllib.experiment.scheduler import Status
 from music_rllib.experiment.sweep_files import SEARCH, as_json
 from music_rllib.redaction import redact
@@ -54,7 +55,7 @@ def open_tracker(opened: OpenSweep) -> Tracker:
     tracker = Tracker(
         sweep_name=opened.config.name,
         storage=opened.storage,
-        config=opened.config.document,
+        config=configuration_of(opened.config),
         tracking_uri=opened.config.mlflow.tracking_uri,
     )
     tracker.keep_view(
@@ -82,7 +83,7 @@ def compute_and_report(
         tracker.put_sweep_artifact(names.ARTIFACT_ANALYSIS_PLAN, as_json(plans))
     with (
         Display(console, opened.plan, opened.scheduler) as display,
-        StateFile(opened) as state_file,
+        StateFile(opened, drivers.stop_before) as state_file,
     ):
         mlflow_log = MlflowListener(tracker, opened.store, opened.environments.now)
         mlflow_log.postpones = shares  # the last driver logs what none of them has computed

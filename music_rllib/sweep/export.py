@@ -197,7 +197,8 @@ def sweep_of_run(sweep: OpenSweep, key: str, folder: Path) -> dict[str, Any]:
     A handoff from outside that it starts from is copied from a bucket into `folder`.
     """
     chain = sweep.plan.chain(key)
-    tasks = {node.run.task.name: node.run.task for node in chain}
+    sources = [node.input.task for node in chain if node.input is not None]
+    tasks = {task.name: task for task in (*sources, *(node.run.task for node in chain))}
     environments = {
         name: task.model_dump(mode="json", exclude={"name"})
         for name, task in tasks.items()

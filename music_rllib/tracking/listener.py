@@ -91,7 +91,8 @@ def finished_run(store: NodeStore, node: Node) -> StoredRun:
     Raises:
         DamagedError: The run's history cannot be read.
     """
-    return StoredRun(store.history(node.key), partial(_policy, store, node))
+    policy = partial(_policy, store, node)
+    return StoredRun(store.history(node.key), policy, store.provenance(node.key))
 
 
 def _policy(store: NodeStore, node: Node) -> bytes | None:

@@ -35,6 +35,8 @@ class StoredRun(NamedTuple):
     reports: Sequence[Report]
     read_policy: Callable[[], bytes | None] | None = None
     """Reads the policy; called after the histories of all runs were sent."""
+    provenance: Mapping[str, str] = {}
+    """Tags that name the code that computed it; another version may send it."""
 
 
 _PLACE = (
@@ -207,6 +209,7 @@ class RunQueue:
             return
         stored = read()
         self._read_policy = stored.read_policy
+        self._info = replace(self._info, tags={**self._info.tags, **stored.provenance})
         times = [report.timestamp_ms for report in stored.reports] or [_now()]
         unfinished = {names.TAG_INCOMPLETE: "its policy is not uploaded yet"}
         left = self._begin(times[0], {} if stored.read_policy is None else unfinished)

@@ -140,24 +140,24 @@ def stop(
     name = location.name
     console = console_for(as_json=json)
 
-    state = state_of(location)["state"]
+    def runs() -> bool:  # a driver that is starting has no state yet
+        return bool(drivers_of(location)) or state_of(location)["state"] == "running"
+
     deadline = time.monotonic() + wait
-    while state != "running" and drivers_of(location) and time.monotonic() < deadline:
-        time.sleep(0.5)  # the sweep is starting
-        state = state_of(location)["state"]
-    was_running = state == "running"
+    is_running = was_running = runs()
     if was_running:
         location.write(sweep_files.STOP, sweep_files.as_json({"stop": time.time_ns()}))
-        while state == "running" and time.monotonic() < deadline:
+        while is_running and time.monotonic() < deadline:
             time.sleep(0.5)
-            if not drivers_of(location):
-                state = state_of(location)["state"]
-        console.print(f"{name}: {'was told to stop' if state == 'running' else 'has stopped'}")
+            is_running = runs()
+    state = state_of(location)["state"]
+    if was_running:
+        console.print(f"{name}: {'was told to stop' if is_running else 'has stopped'}")
     else:
         console.print(f"{name}: is not running ({state})")
     if json:
         print_json({"sweep": name, "was_running": was_running, "state": state})
-    return FAILED if state == "running" and wait > 0 else 0
+    return FAILED if is_running and wait > 0 else 0
 
 
 COMPARE_EXAMPLES = """\

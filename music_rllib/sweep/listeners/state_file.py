@@ -42,8 +42,9 @@ MOST_FAILURES = 1000
 class StateFile(Listener):
     """Keeps `state.json` up to date and checks for `stop.json` in a thread of its own."""
 
-    def __init__(self, sweep: OpenSweep) -> None:
-        self._sweep = sweep
+    def __init__(self, sweep: OpenSweep, stop_before: Any = None) -> None:
+        """Of a sweep whose driver has begun after the request to stop `stop_before`."""
+        self._sweep, self._stop_before = sweep, stop_before
         self.searches: Callable[[], list[dict[str, Any]]] = list
         """Function that returns the results of the sweep's searches so far."""
         self.unfinished: dict[str, RunResult] = {}
@@ -65,8 +66,6 @@ class StateFile(Listener):
         }
         self._state: dict[str, Any] = {}
         self._next_update = 0.0
-        self._stop_before: Any = None
-        """An earlier request to stop."""
         self._written_trials = 0
         """Number of trials in the last `plan.json`."""
         self._ended = threading.Event()
@@ -74,7 +73,6 @@ class StateFile(Listener):
         self._interval = REMOTE_SECONDS if is_remote(sweep.storage) else LOCAL_SECONDS
 
     def __enter__(self) -> Self:
-        self._stop_before = self._sweep.location.read(sweep_files.STOP)
         for node in self._sweep.scheduler.having(Status.REUSED):
             self.reused(node)
         self._update()
@@ -225,10 +223,12 @@ class StateFile(Listener):
     def _to_come(self) -> int:
         """Largest number of environment steps of runs that the searches will still add."""
         config, plan = self._sweep.config, self._sweep.plan
+        complete = {one["stage"] for one in self.searches() if one["complete"]}
         steps = 0
         for stage in config.stages:
             asked = [run for run in plan.runs if run.stage == stage.name]
-            if stage.search is None or any(run.part.startswith("final") for run in asked):
+            begun = any(run.part.startswith("final") for run in asked)
+            if stage.search is None or begun or stage.name in complete:
                 continue  # the runs on fresh seeds come last and all at once
             at_most = sum(one.all_env_steps for one in searched_runs(config, stage))
             known = sum(node.run.env_steps for node in plan.nodes if node.stage == stage.name)

@@ -348,8 +348,10 @@ def test_a_deleted_sweep_that_starts_again_has_new_runs(
 
 def test_a_reused_node_is_logged_once(storage: Path, tracker_on: MakeTracker) -> None:
     tracker = tracker_on()
+    code = {names.TAG_GIT_COMMIT: "of its training"}
+    of_store = StoredRun([report(step, time=step) for step in STEPS], provenance=code)
     tracker.mirror(run_info("old"), stored(STEPS))
-    tracker.mirror(run_info("old"), stored(STEPS))
+    tracker.mirror(run_info("old"), lambda: of_store)
     tracker.start(run_info("new", source_node="old"))
     tracker.log("new", later([2000]))
     tracker.mirror(run_info("new", source_node="old"), lambda: StoredRun(later([2000])))
@@ -371,6 +373,7 @@ def test_a_reused_node_is_logged_once(storage: Path, tracker_on: MakeTracker) ->
     old, new = runs["renamed/old"], runs["finetune/new"]
     assert (old.data.tags[names.TAG_STAGE], old.data.tags[names.TAG_TRIAL]) == ("renamed", "3")
     assert logged_steps(client, old) == STEPS
+    assert old.data.tags[names.TAG_GIT_COMMIT] == "of its training"
     assert (old.info.start_time, old.info.end_time) == (1_700_002_000_000, 1_700_020_000_000)
     assert new.data.tags[names.TAG_SOURCE_RUN] == old.info.run_id
 

@@ -295,6 +295,15 @@ def test_a_storage_can_name_environment_variables(
 BAD: list[tuple[Document, str]] = [
     (changed(name=1), "sweep.yaml:1: name must be text, got 1"),
     (changed(name="nodes"), "name must not be 'nodes'"),
+    (changed(name="environments.json"), "name must not be 'environments.json'"),
+    (
+        changed(
+            environments={
+                "M": {"env_id": "m:M", "horizon": 9, "env_kwargs": {"pass_through": True}}
+            }
+        ),
+        "environments.M.env_kwargs.pass_through must have another name or value: this one looks",
+    ),
     (changed(storag="x"), "storag is not a known setting (did you mean 'storage'?)"),
     (changed(tasks=["FetchPsh"]), "got 'FetchPsh' (did you mean 'FetchPush'?)"),
     (changed(tasks=[]), "tasks must not be empty, got []"),

@@ -20,10 +20,12 @@ from music_rllib.experiment.open_sweep import (
     remove_runs,
 )
 from music_rllib.experiment.plan import Node, continuation_key, make_plan
+from music_rllib.experiment.record import changes_since, keep_record
 from music_rllib.experiment.scheduler import Status
 from music_rllib.results.analysis import mixed
 from music_rllib.store.history import RunResult
 from music_rllib.store.lease import Lease
+from music_rllib.sweep.clean import remove_started, started_from
 from tests.sweep_files import loaded
 
 OLD = {"package mujoco": "3.8.0", "source lab_env.py": "a"}
@@ -114,6 +116,20 @@ def test_checkpoints_and_ends_of_shorter_runs_are_checked(tmp_path: Path) -> Non
     assert not place.names()
 
 
+def test_a_run_that_is_extended_twice_does_not_lose_its_checkpoint(tmp_path: Path) -> None:
+    """The finished end of 400 steps is shorter than the checkpoint of the run with 800."""
+    first = finished(tmp_path)
+    pretrain = first.plan.nodes[0]
+    with first.store.continuation(continuation_key(pretrain.run, None)).new_checkpoint(400, OLD):
+        pass
+    second = opened(tmp_path, OLD, env_steps=800)
+    assert changes_since(second) is None
+    keep_record(second)
+    with first.store.work_folder(second.plan.nodes[0].key).new_checkpoint(600, OLD):
+        pass
+    assert "is at 600 env steps" in str(changes_since(opened(tmp_path, OLD, env_steps=1200)))
+
+
 def test_runs_that_start_from_a_retrained_run_are_retrained(tmp_path: Path) -> None:
     finished(tmp_path)
     sweep = opened(tmp_path, NEW)
@@ -135,6 +151,36 @@ def test_runs_that_start_from_a_retrained_run_are_retrained(tmp_path: Path) -> N
     sweep = remove_runs(sweep, again, print)
     assert [sweep.scheduler[node.key] for node in sweep.plan.nodes] == [Status.WAITING] * 2
     assert not sweep.store.is_finished(pretrain.key)
+
+
+def test_runs_of_other_sweeps_that_start_from_a_retrained_run_are_deleted(tmp_path: Path) -> None:
+    """Their keys do not change, so they would be reused."""
+    done = finished(tmp_path)
+    keep_record(opened(tmp_path, NEW, "another"))
+    pretrain, finetune = done.plan.nodes
+    (started,) = started_from(done.location, [pretrain.key])
+    assert (started["key"], started["label"]) == (finetune.key, f"another: {finetune.label}")
+    said: list[str] = []
+    remove_started(done.store, [started], said.append)
+    assert not done.store.is_finished(finetune.key)
+    assert said == [f"another: {finetune.label}: deleted, it starts from a run to be retrained"]
+    # Also if the run is in an earlier plan only.
+    other = opened(tmp_path, NEW, "another", env_steps=500)
+    keep_record(other)
+    labels = [one["label"] for one in started_from(done.location, [pretrain.key])]
+    assert labels == [f"another: {finetune.label} (earlier version)"]
+
+
+def test_a_damaged_manifest_does_not_hide_the_choice_to_retrain(tmp_path: Path) -> None:
+    sweep = finished(tmp_path)
+    key = sweep.plan.nodes[0].key
+    Path(sweep.store.path(key), "manifest.json").write_text('{"version"')
+    now = sweep.environments.now
+    damaged = open_sweep(
+        sweep.config, make_plan(sweep.config), sweep.storage, environments=now, lenient=True
+    )
+    assert key in damaged.damaged
+    assert key in {run.key for run in found_runs(damaged)}
 
 
 def test_a_decision_applies_to_every_sweep_in_the_storage(tmp_path: Path) -> None:

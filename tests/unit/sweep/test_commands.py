@@ -584,6 +584,8 @@ def test_clean_keeps_a_last_checkpoint_that_another_sweep_shares(
     assert kept["what"] == f"last checkpoint of {node.label}: long has it too"
     assert len(last.names()) == 1
     longer.location.files.remove("plan.json")
+    opened(storage, tmp_path, defaults={"env_steps": 8000})  # now two runs of `mine` share it
+    assert len(program("clean", f"{storage}/mine", "--json").document["items"]) == 1
     assert program("clean", f"{storage}/mine", "--yes").code == 0
     assert not last.names()
 
@@ -746,6 +748,18 @@ def test_stop_reaches_the_driver(
         signal.signal(signal.SIGINT, before)
     again = program("stop", f"{storage}/mine", "--json").document
     assert again == {"sweep": "mine", "was_running": False, "state": "stopped"}
+
+
+def test_stop_reaches_a_driver_that_is_starting(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    sweep = opened(storage, tmp_path)
+    with driver_lock.driving(sweep.location) as drivers:
+        asked = program("stop", f"{storage}/mine", "--wait", "0")
+        assert (asked.code, "was told to stop" in asked.output) == (0, True)
+        assert StateFile(sweep, drivers.stop_before)._stop_requested()
+    with driver_lock.driving(sweep.location) as drivers:
+        assert not StateFile(sweep, drivers.stop_before)._stop_requested(), "for an earlier driver"
 
 
 def test_a_driver_that_was_killed_is_interrupted(
