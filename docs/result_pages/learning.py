@@ -25,8 +25,13 @@ from music_rllib.results.statistics import Array
 from music_rllib.results.study import study_of
 
 PRETRAINING = ("MUSIC-u (pretraining)", Style("#9a9a9a", "o"))
-NOT_IN_THE_PICTURE = ("equal-entropy", "equal-entropy-fixed", "claims-pick-and-place")
-"""Studies without a decided comparison of q. Another subplot shows their task; six fit."""
+NOT_IN_THE_PICTURE = (
+    "equal-entropy",
+    "equal-entropy-fixed",
+    "claims-pick-and-place",
+    "claims-slide",
+)
+"""Studies whose task another subplot shows; six fit."""
 SCRATCH = ("HER alone, q = 1", Style("#4d4d4d", "D", (6, 3)))
 (SUCCESS,) = (metric for metric in METRICS if metric.name == names.EVAL_SUCCESS)
 

@@ -41,6 +41,7 @@ STUDIES = {
     "joint-pick": "joint entropy, MUSIC-r",
     "pick-and-place-in-80000-steps": "q = 1, 80,000 steps in all",
     "claims-pick-and-place": MUSIC,
+    "joint-slide": "joint entropy, MUSIC-r",
     "claims-slide": MUSIC,
 }
 """Setting of each study."""

@@ -34,6 +34,7 @@ STUDIES = {  # export and compared stage
     ("FetchPush", MUSIC): ("claims-push", "music-r"),
     ("FetchPickAndPlace", "joint entropy, MUSIC-r"): ("joint-pick", "music-r"),
     ("FetchPickAndPlace", MUSIC): ("claims-pick-and-place", "music-r"),
+    ("FetchSlide", "joint entropy, MUSIC-r"): ("joint-slide", "music-r"),
     ("FetchSlide", MUSIC): ("claims-slide", "music-r"),
 }
 TOTALS = {"claims-pick-and-place": 200_000, "joint-music": 30_000}
@@ -41,6 +42,7 @@ TOTALS = {"claims-pick-and-place": 200_000, "joint-music": 30_000}
 COUNTED = {
     **dict.fromkeys(("joint-music", "equal-entropy-fixed", "equal-entropy"), 30_000),
     **dict.fromkeys(("joint-pick", "pick-and-place-in-80000-steps"), 80_000),
+    "joint-slide": 200_000,
 }
 """Steps of the studies whose metric counts the pretraining."""
 IN_DETAIL = {
@@ -52,7 +54,7 @@ IN_DETAIL = {
     "claims-slide": "## FetchSlide\n",
 }
 """Studies whose tables are on the page of details: the text before them."""
-WITH_HER = ("claims-pick-and-place",)
+WITH_HER = ("claims-pick-and-place", "joint-slide")
 """Studies whose plan also compares MUSIC-r at q = 1 with HER alone."""
 BETWEEN_Q = (("1.5", "1"), ("2", "1.5"), ("2", "1"))
 KINDS = ("p", "tost")
@@ -460,3 +462,39 @@ def test_music_r_on_30_seeds_of_three_studies() -> None:
         f"(95% CI {low:.0%} to {high:.0%}), {sum(finals >= 0.9)} of them at 90% or more."
     )
     assert text in " ".join(PAGE.split())
+
+
+def test_the_observations_in_the_joint_form_on_fetchslide() -> None:
+    study, text = "joint-slide", " ".join(PAGE.split())
+
+    def last(metric: str, stage: str, q: str) -> pd.Series:
+        own = runs(study, stage).query("q == @q")
+        return pd.Series([curve(study, run, metric)[1][-1] for run in own.run], own.seed)
+
+    def interval(gap: pd.Series, decimals: str) -> str:
+        ends = stats.t.interval(0.95, len(gap) - 1, gap.mean(), stats.sem(gap))
+        return " to ".join(f"{end:{decimals}}" for end in ends)
+
+    gaps = [
+        areas(study, "music-r", a, MEAN) - areas(study, "music-r", b, MEAN) for a, b in BETWEEN_Q
+    ]
+    spread = [gap.std() for gap in gaps]
+    assert f"standard deviation of {min(spread):.2f} to {max(spread):.2f}" in text
+    ends = [last(MEAN, "music-r", q).mean() for q in ("1", "1.5", "2")]
+    assert f"All q end at {100 * min(ends):.0f} to {max(ends):.0%}." in text
+    one, *others = (last(ENTROPIES[0], "music-r", q) for q in ("1", "1.5", "2"))
+    means = " and ".join(f"{(one - other).mean():.2f}" for other in others)
+    intervals = " and ".join(interval(one - other, ".2f") for other in others)
+    found = f"{means} nats narrower than those of q = 1 (95% CI {intervals}; not planned)"
+    assert found in text
+    behind = 100 * (last(MEAN, "her", "1") - last(MEAN, "music-r", "1"))
+    points = f"{behind.mean():.0f} percentage points below (95% CI {interval(behind, '.0f')}"
+    assert points in text
+    alone, own = (
+        pd.Series([area(*curve(study, run, MEAN), 150_000) for run in of.run], of.seed)
+        for of in (runs(study, "her"), runs(study, "music-r").query("q == '1'"))
+    )
+    assert (
+        f"its 150,000 steps have an area of {own.mean():.2f}, the first 150,000 of HER alone "
+        f"{alone.mean():.2f} (95% CI of the difference {interval(own - alone, '.2f')})"
+    ) in text
