@@ -162,7 +162,7 @@ def test_tasks_without_success_show_their_return_from_the_first_line_to_the_repo
     assert "No videos: " in page
     assert "it has no rgb_array rendering" in page
     assert "Nothing was evaluated" not in page
-    assert 'id="finetune-return"' in page
+    assert 'id="subplots-finetune-return"' in page
     assert (report / "figures" / "finetune-final-return.svg").is_file()
     table = (report / "tables" / "final.csv").read_text()
     assert len(re.findall(r"finetune,Point,q = \d,return,-\d", table)) == 2
