@@ -228,12 +228,10 @@ class RunSettings(StrictModel):
     @property
     def architecture(self) -> Architecture:
         """Settings that determine the shapes or the meaning of the networks' arrays."""
-        default = 1 if self.tac.policy == "deterministic" else 2
         return Architecture(
             hidden_sizes=self.tac.hidden_sizes,
             layer_norm=self.tac.layer_norm,
-            # Handoffs without this setting have the default.
-            critics=None if self.tac.critic_count == default else self.tac.critic_count,
+            critics=self.tac.critics,
             quantiles=self.tac.quantiles,
             policy=self.tac.policy,
             bootstrap=self.tac.bootstrap,

@@ -50,6 +50,7 @@ class Architecture(StrictModel):
     hidden_sizes: tuple[int, ...]
     layer_norm: str = "none"
     critics: int | None = None
+    """None: the default of the policy."""
     quantiles: int = 0
     policy: str
     bootstrap: str
@@ -76,7 +77,11 @@ class Architecture(StrictModel):
         fields += ["critics", "quantiles", "log_std_form"]
         if self.log_std_form == other.log_std_form:
             fields.append("log_std_bounds")
-        return [f"tac.{name}" for name in fields if getattr(self, name) != getattr(other, name)]
+        mine, theirs = (
+            one.model_copy(update={"critics": one.critics or 2 - (one.policy == "deterministic")})
+            for one in (self, other)
+        )
+        return [f"tac.{name}" for name in fields if getattr(mine, name) != getattr(theirs, name)]
 
 
 class Spaces(StrictModel):

@@ -14,7 +14,7 @@ import socket
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
 
 from music_rllib.config.run_settings import VARIANTS
@@ -208,11 +208,15 @@ class StateFile(Listener):
             if VARIANTS[stage.variant].fixed["task_reward"]
             and (stage.search is not None or trials[stage.name] > 1)
         ]
-        now = self._last_values.sweep(self._results)
+        now, to_come = self._last_values.sweep(self._results), self._to_come(searches)
         self._state = {
             "sweep": sweep.config.name,
             "stages": stages,
-            "env_steps": {"done": steps_done, "left": steps_left, "to_come": self._to_come()},
+            "env_steps": {
+                "done": steps_done,
+                "left": steps_left,
+                "to_come": to_come,
+            },
             "running": running,
             "best": best_so_far(compared, sweep.plan, now, searches),
             "searches": searches,
@@ -220,10 +224,10 @@ class StateFile(Listener):
             "failures": self._failures[-MOST_FAILURES:],
         }
 
-    def _to_come(self) -> int:
+    def _to_come(self, searches: Sequence[Mapping[str, Any]]) -> int:
         """Largest number of environment steps of runs that the searches will still add."""
         config, plan = self._sweep.config, self._sweep.plan
-        complete = {one["stage"] for one in self.searches() if one["complete"]}
+        complete = {one["stage"] for one in searches if one["complete"]}
         steps = 0
         for stage in config.stages:
             asked = [run for run in plan.runs if run.stage == stage.name]
