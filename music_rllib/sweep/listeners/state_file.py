@@ -212,11 +212,7 @@ class StateFile(Listener):
         self._state = {
             "sweep": sweep.config.name,
             "stages": stages,
-            "env_steps": {
-                "done": steps_done,
-                "left": steps_left,
-                "to_come": to_come,
-            },
+            "env_steps": {"done": steps_done, "left": steps_left, "to_come": to_come},
             "running": running,
             "best": best_so_far(compared, sweep.plan, now, searches),
             "searches": searches,
