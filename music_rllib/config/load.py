@@ -152,7 +152,7 @@ def _check_recorded(value: Any, findings: Findings) -> None:
             continue
         kept = without_secrets(inner)
         for name in inner:
-            if kept.get(str(name), None if inner[name] is not None else 0) != inner[name]:
+            if str(name) not in kept or kept[str(name)] != inner[name]:
                 rule = "must have another name or value: this one looks like a secret, which is"
                 findings.add((key, name), f"{rule} not recorded for `resume`")
 
