@@ -40,7 +40,7 @@ from music_rllib.report.page import runs_table
 from music_rllib.results.archive import read_archive
 from music_rllib.results.conditions import find_stages
 from music_rllib.results.data import ReportError
-from music_rllib.results.tables import search_in_words, search_tables
+from music_rllib.results.search_tables import search_in_words, search_tables
 from music_rllib.store.handoff import HandoffError
 from music_rllib.store.sealed import SealedFolders
 from music_rllib.store.serialization import StateError, read_state, write_state

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from docs.result_pages.runs import provenance
 from docs.result_pages.words import row, rule
 from music_rllib.results.data import Sweep
-from music_rllib.results.tables import search_in_words, search_tables
+from music_rllib.results.search_tables import search_in_words, search_tables
 
 
 def search_text(sweep: Sweep) -> Iterator[str]:

@@ -27,17 +27,9 @@ from music_rllib.results.analysis import StageAnalysis
 from music_rllib.results.answer import answer, planned_in_words
 from music_rllib.results.conditions import SIDE_BY_SIDE, StageRuns
 from music_rllib.results.data import Sweep
+from music_rllib.results.search_tables import search_in_words, search_tables
 from music_rllib.results.study import Study, study_of
-from music_rllib.results.tables import (
-    DASH,
-    Code,
-    Seconds,
-    Table,
-    performance_tables,
-    search_in_words,
-    search_tables,
-    study_tables,
-)
+from music_rllib.results.tables import DASH, Code, Seconds, Table, performance_tables, study_tables
 
 # The page may fetch nothing and run only its own script, whatever text a sweep puts into it.
 # Styles cannot be restricted by a hash: Matplotlib's SVGs have style attributes.

@@ -130,7 +130,8 @@ def _changed_tests(hypothesis: str, before: AnalysisPlan, after: AnalysisPlan) -
 def claim_in_words(claim: Claim) -> str:
     """`q = 1.5 against q = 1 on FetchPush: superior, +0.12 (95% CI 0.05 to 0.19; p = 0.002)`."""
     where = "over all tasks" if claim.task == ALL_TASKS else f"on {claim.task}"
-    mean = f", averaged over {len(claim.pairs)} settings" if len(claim.pairs) > 1 else ""
+    count = len(claim.pairs)
+    mean = f", averaged over the {count} settings that both have" if count > 1 else ""
     held = {True: ", as expected", False: ", not as expected", None: ""}[claim.confirmed]
     return (
         f"{claim.first} against {claim.second} {where}{mean}: {verdict_in_words(claim)}, "

@@ -277,7 +277,9 @@ def test_the_verdicts_at_several_alphas() -> None:
     pairs = (("1.5", "1"), ("2", "1"), ("2", "1.5"))
     sides = {q: areas("q-entropy-factorial", "her", q, MEAN) for q in ("1", "1.5", "2")}
     claims = decided([compared(sides[a], sides[b]) for a, b in pairs])
-    found = re.findall(r"^- q = .*, averaged over 5 settings: (.*)\.$", DETAILS, re.MULTILINE)
+    found = re.findall(
+        r"^- q = .*, averaged over the 5 settings that both have: (.*)\.$", DETAILS, re.MULTILINE
+    )
     texts = [in_words(one, planned=True) + not_excluded(one) for one in claims]
     assert found == [text.replace("**", "") for text in texts]
 

@@ -16,8 +16,8 @@ from music_rllib.config.run_settings import RunSettings
 from music_rllib.experiment.plan import Plan, short
 from music_rllib.experiment.scheduler import Status
 from music_rllib.names import ShortLabels
+from music_rllib.results.search_tables import search_in_words, search_tables
 from music_rllib.results.tables import Table as DataTable
-from music_rllib.results.tables import search_in_words, search_tables
 from music_rllib.search.best import best_text
 from music_rllib.store.history import RunResult
 from music_rllib.store.node_store import TRAIN_AGAIN

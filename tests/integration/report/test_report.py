@@ -25,7 +25,7 @@ from music_rllib.report.build import PAGE
 from music_rllib.results.archive import Format, read_archive, write_archive
 from music_rllib.results.data import Sweep
 from music_rllib.results.read import read_sweep
-from music_rllib.results.tables import search_tables
+from music_rllib.results.search_tables import search_tables
 from music_rllib.store.history import HISTORY, Report, RunResult, last_values, to_json_lines
 from music_rllib.sweep.listeners.state_file import StateFile
 from tests.processes import fresh, wait_until

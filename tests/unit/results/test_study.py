@@ -17,7 +17,7 @@ from music_rllib.report.figures.choice import drawings_of_stages, study_drawings
 from music_rllib.report.figures.draw import files
 from music_rllib.results.analysis_plan import AnalysisPlan, PlanVersion, checked_plans, with_plan
 from music_rllib.results.analysis_plan import as_document as plans_as_document
-from music_rllib.results.answer import answer, power_in_words
+from music_rllib.results.answer import answer, claim_in_words, power_in_words
 from music_rllib.results.claims import Verdict
 from music_rllib.results.conditions import find_stages
 from music_rllib.results.data import Points, RunRecord, Sweep, columns
@@ -335,10 +335,11 @@ def test_a_late_hypothesis_does_not_make_others_of_its_version_late(
 
 
 def test_settings_that_a_hypothesis_does_not_name_are_averaged(rng: np.random.Generator) -> None:
-    q_1 = ("1", "0.01", 0.1), ("1", "0.1", 0.3)
+    q_1 = ("1", "0.01", 0.1), ("1", "0.1", 0.3), ("1", "1", 0.9)
     runs = cells(rng, 5, *q_1, ("1.5", "0.01", 0.2), ("1.5", "0.1", 0.4))
     (claim,) = study_of(sweep_of(runs, BEFORE)).planned
     assert (len(claim.pairs), claim.contrast.seeds) == (2, (5, 5))
+    assert "on FetchPush, averaged over the 2 settings that both have: " in claim_in_words(claim)
     assert float(claim.contrast.difference.value) == pytest.approx(0.1, abs=0.03)
     one = with_plan((), plan("q = 1.5, alpha = 0.1 against q = 1, alpha = 0.01"), 5)
     (claim,) = study_of(sweep_of(runs, one)).planned
