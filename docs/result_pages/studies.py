@@ -43,7 +43,6 @@ def outcomes_table(sweep: Sweep, *stages: str) -> Iterator[str]:
             *rates,
             "Shannon entropy at the end, nats",
             "S_q at the end",
-            "seeds",
         ]
     ]
     for analysis in analyse(sweep):
@@ -76,7 +75,6 @@ def _outcomes(sweep: Sweep, analysis: StageAnalysis, mean: Mean, prefix: str) ->
             yield wait_text(wait.median)
     for entropy in analysis.entropies[mean.task, mean.condition]:
         yield spread(entropy) if entropy else ""
-    yield f"{len(mean.scores.by_seed)} of {mean.runs}"
 
 
 def seeds_table(sweep: Sweep) -> Iterator[str]:

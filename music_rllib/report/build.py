@@ -28,6 +28,8 @@ from music_rllib.envs.tasks import Task
 from music_rllib.names import ShortLabels, in_runs
 from music_rllib.report.charts import curves_csv
 from music_rllib.report.figures.choice import (
+    AGAINST_ENTROPY,
+    FINALS,
     Drawing,
     drawings_of_stages,
     overview,
@@ -37,7 +39,7 @@ from music_rllib.report.figures.choice import (
 from music_rllib.report.figures.draw import files
 from music_rllib.report.figures.plots import Legend, Subplot
 from music_rllib.report.page import SweepReport, render, runs_table
-from music_rllib.report.two_sweeps import difference_tables
+from music_rllib.report.two_sweeps import difference_tables, titled
 from music_rllib.report.videos import Videos, make_videos
 from music_rllib.results.analysis import METRICS, StageAnalysis, analyse, mixed
 from music_rllib.results.answer import claim_rows, mean_rows
@@ -98,19 +100,21 @@ def build_report(
     """
     analyses = analyse(sweep)
     stages = [analysis.stage for analysis in analyses]
-    study = study_of(sweep)
+    # Each of two sweeps has a plan of its own.
+    studies = {f"{title}: ": study_of(one) for title, one in titled(both)}
+    studies = studies or {"": study_of(sweep)}
     drawings = chain(
         *(stage_drawings(sweep, analysis) for analysis in analyses),
         drawings_of_stages(sweep, stages),
-        study_drawings(study),
+        *(study_drawings(study, title) for title, study in studies.items()),
     )
     sentences = limitations(sweep, analyses, live=live or both is not None)
-    for one in both or ():  # each has a plan of its own
+    for one in both or ():
         sentences += [f"{one.name}: {line}" for line in _missing(one)]
     return SweepReport(
         sweep=sweep,
         analyses=analyses,
-        study=study,
+        studies=studies,
         both=both,
         drawings=list(_with_own_names(_without_chance(drawings, stages))),
         differences=() if both is None else difference_tables(*both, analyses),
@@ -123,13 +127,15 @@ def build_report(
 def _without_chance(drawings: Iterator[Drawing], stages: Sequence[StageRuns]) -> Iterator[Drawing]:
     """The drawings, without the success of stages whose success is chance, if others train for it.
 
-    Such curves look like failure.
+    It looks like failure.
     """
     rewarded = [stage.name for stage in stages if stage.has_task_reward]
     unrewarded = {stage.name for stage in stages if rewarded and stage.name not in rewarded}
     for drawing in drawings:
-        is_rate = drawing.metric is not None and drawing.metric.name in names.EVAL_RATES
-        if not (is_rate and drawing.stage in unrewarded):
+        is_success = drawing.title in (FINALS[names.EVAL_SUCCESS], AGAINST_ENTROPY) or (
+            drawing.metric is not None and drawing.metric.name in names.EVAL_RATES
+        )
+        if not (is_success and drawing.stage in unrewarded):
             yield drawing
 
 
@@ -347,10 +353,14 @@ def _files_of(report: SweepReport) -> Iterator[tuple[str, bytes]]:
         yield f"videos/{video.file}", video.data
     tables = [*performance_tables(report.analyses), runs_table(report.sweep)]
     numbers = [(table.name, table.to_csv()) for table in tables]
-    numbers += [
-        ("curves", curves_csv(report.drawings)),
-        ("area_under_curve", to_csv(mean_rows(report.study))),
-        ("comparisons", to_csv(claim_rows(report.study))),
-    ]
+    numbers.append(("curves", curves_csv(report.drawings)))
+    for name, rows_of in (("area_under_curve", mean_rows), ("comparisons", claim_rows)):
+        rows = [
+            ({"sweep": title.removesuffix(": ")} if title else {}) | row
+            for title, study in report.studies.items()
+            for row in rows_of(study)
+        ]
+        numbers.append((name, to_csv(rows)))
     for name, text in numbers:
-        yield f"tables/{name}.csv", text.encode()
+        if text.strip():  # a table without rows has no columns
+            yield f"tables/{name}.csv", text.encode()

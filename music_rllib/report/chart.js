@@ -24,10 +24,10 @@ function shown(value) {
 /** Round numbers from `low` to `high`, about `count` of them. */
 function ticksOf(low, high, count) {
   const raw = (high - low) / Math.max(1, count), power = 10 ** Math.floor(Math.log10(raw));
-  const step = [1, 2, 2.5, 5, 10].find((one) => one * power >= raw * 0.999) * power;
+  const round = [1, 2, 2.5, 5, 10].find((one) => one * power >= raw * 0.999), step = round * power;
   const ticks = [];
   for (let at = Math.ceil(low / step - 1e-9); at * step <= high + step * 1e-9; at++) ticks.push(at * step);
-  const decimals = Math.max(0, -Math.floor(Math.log10(step * 1.0001)) + (step / power === 2.5 ? 1 : 0));
+  const decimals = Math.max(0, -Math.floor(Math.log10(step * 1.0001)) + (round === 2.5 ? 1 : 0));
   const text = (value) => {
     for (const [unit, sign] of [[1e9, "G"], [1e6, "M"], [1e3, "k"]]) {
       const digits = decimals + Math.log10(unit);
@@ -73,7 +73,8 @@ function lineThrough(points) {
 function limitsOf(curves, metric) {
   if (metric.limits) return metric.limits;
   // The lines set the limits: a band of two seeds may be many times as wide.
-  const all = curves.flatMap((curve) => [curve.mean, ...curve.seeds]).flat().filter((v) => v !== null);
+  const lines = (curve) => [curve.mean, ...(curves.length <= MOST_BANDS ? curve.seeds : [])];
+  const all = curves.flatMap(lines).flat().filter((v) => v !== null);
   let low = all.length ? all.reduce((a, b) => Math.min(a, b)) : 0;
   let high = all.length ? all.reduce((a, b) => Math.max(a, b)) : 1;
   if (low === high) [low, high] = [low - 0.5, high + 0.5];
@@ -90,9 +91,9 @@ function drawSubplot(box, { title, curves, metric, xLabel }) {
   const yTicks = ticksOf(low, high, 5);
   const margin = {
     left: 26 + LETTER * Math.max(...yTicks.map(([, text]) => text.length)),
-    right: 14, top: title ? 26 : 10, bottom: 40,
+    right: 14, top: 10, bottom: 40,
   };
-  const last = Math.max(...curves.map((curve) => curve.x.at(-1) ?? 0), 1e-9);
+  const last = Math.max(...curves.map((curve) => curve.x.at(-1) ?? 0)) || 1;
   const plotWidth = width - margin.left - margin.right, plotHeight = height - margin.top - margin.bottom;
   const px = (x) => margin.left + x / last * plotWidth;
   const py = (y) => margin.top + (high - y) / (high - low) * plotHeight;
@@ -103,12 +104,11 @@ function drawSubplot(box, { title, curves, metric, xLabel }) {
   const clip = `clip-${++subplots}`;
   element("rect", { x: margin.left, y: margin.top - 2, width: plotWidth + 2, height: plotHeight + 4 },
     element("clipPath", { id: clip }, svg));
-  if (title) element("text", { x: margin.left, y: 16, class: "title" }, svg, title);
   for (const [value, text] of yTicks) {
     element("line", { x1: margin.left, x2: width - margin.right, y1: py(value), y2: py(value), class: "grid" }, svg);
     element("text", { x: margin.left - 5, y: py(value) + 4, "text-anchor": "end" }, svg, text);
   }
-  for (const [value, text] of ticksOf(0, last, Math.min(6, plotWidth / 55))) {
+  for (const [value, text] of curves.length ? ticksOf(0, last, Math.min(6, plotWidth / 55)) : []) {
     element("line", { x1: px(value), x2: px(value), y1: margin.top, y2: margin.top + plotHeight, class: "grid" }, svg);
     const anchor = px(value) > width - 20 ? "end" : "middle";
     element("text", { x: px(value), y: height - margin.bottom + 15, "text-anchor": anchor }, svg, text);
@@ -125,7 +125,7 @@ function drawSubplot(box, { title, curves, metric, xLabel }) {
   element("path", {
     d: `M${margin.left} ${margin.top}V${margin.top + plotHeight}H${width - margin.right}`, class: "axis",
   }, svg);
-  box.replaceChildren(svg);
+  box.replaceChildren(...(title ? [element("p", { class: "title" }, null, title)] : []), svg);
   readable(box, svg, { curves, px, last, margin, plotHeight, xLabel });
 }
 

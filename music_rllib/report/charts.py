@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from music_rllib import names
-from music_rllib.report.figures.choice import Drawing, Facets
+from music_rllib.report.figures.choice import PRIMARY, Drawing, Facets
 from music_rllib.results.analysis import Curve
 from music_rllib.results.conditions import SIDE_BY_SIDE
 from music_rllib.results.data import Sweep
@@ -37,12 +37,26 @@ def chart_data(sweep: Sweep, drawings: Sequence[Drawing]) -> dict[str, Any]:
         if drawing.metric is not None:
             metrics[drawing.metric.name] = drawing.metric
             by_stage.setdefault(drawing.stage, []).append(drawing)
-    stages = list(by_stage)
+    stages = [_stage(name, drawn) for name, drawn in by_stage.items()]
+    # A condition has the same style in all figures, because the page has one legend.
+    styles = {
+        one["key"]: {"color": one["color"], "dashes": one["dashes"]}
+        for stage in stages
+        for one in stage["conditions"]
+        if stage["together"]
+    }
+    for one in (one for stage in stages for one in stage["conditions"]):
+        one |= styles.get(one["key"], {})
+    large = [
+        number
+        for number, drawn in enumerate(by_stage.values())
+        if any(drawing.title in PRIMARY for drawing in drawn)
+    ]
     known: KnownAxes = {}
     return {
-        "stages": [_stage(name, drawn) for name, drawn in by_stage.items()],
-        # The stage of the large figure: all together, or the last one.
-        "main": stages.index(SIDE_BY_SIDE) if SIDE_BY_SIDE in stages else max(0, len(stages) - 1),
+        "stages": stages,
+        # The stage of the large figure: all together, or the last one that trains for the task.
+        "main": next((n for n in large if stages[n]["together"]), large[-1] if large else 0),
         "metrics": [asdict(metric) for metric in metrics.values()],
         "curves": {
             str(number): {

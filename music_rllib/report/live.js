@@ -44,8 +44,9 @@ function bar(parent, label, done, whole, text) {
 
 function showState(state) {
   const parent = document.getElementById("live");
-  const box = document.createDocumentFragment();
-  const head = element("p", {}, box);
+  if (!parent.children.length) for (const tag of ["p", "p", "div"]) element(tag, {}, parent);
+  const [above, hint, below] = parent.children;
+  const head = document.createDocumentFragment(), box = document.createDocumentFragment();
   element("strong", {}, head, `The sweep is ${state.state}. `);
   if (state.done !== undefined) {
     const speed = state.speed ? `, ${shown(state.speed)} environment steps per second` : "";
@@ -54,9 +55,11 @@ function showState(state) {
     head.append(`${state.done.toLocaleString("en")} environment steps done, ${most}${state.left.toLocaleString("en")} left${speed}${left}. `);
   }
   if (state.error) head.append(state.error);
-  if (state.command) {
-    const hint = element("p", { class: "soft" }, box, state.state === "running" ? "To stop it: " : "To resume it: ");
-    element("code", {}, hint, state.command);
+  above.replaceChildren(head);
+  const use = state.command ? `${state.state === "running" ? "To stop it: " : "To resume it: "}${state.command}` : "";
+  if (hint.textContent !== use) {  // the reader may have selected it
+    hint.replaceChildren(use.slice(0, use.indexOf(": ") + 2));
+    if (use) element("code", {}, hint, state.command);
   }
   const bars = element("div", { class: "bars" }, box);
   for (const stage of state.stages ?? []) {
@@ -75,7 +78,7 @@ function showState(state) {
     element("strong", {}, line, `${failure.run} failed: `);
     line.append(failure.cause);
   }
-  parent.replaceChildren(box);
+  below.replaceChildren(box);
 }
 
 async function look() {

@@ -146,6 +146,8 @@ function controls() {
   const stage = data.stages[choice.stage];
   const available = data.metrics.filter((metric) => data.curves[choice.stage]?.[metric.name]);
   if (choice.metric && !available.some((metric) => metric.name === choice.metric)) choice.metric = "";
+  const focusable = () => [...parent.querySelectorAll("select, input, button")];
+  const focused = focusable().indexOf(document.activeElement);
   parent.replaceChildren();
   const row = element("div", { class: "choices" }, parent);
   if (data.stages.length > 1) {
@@ -163,6 +165,7 @@ function controls() {
   chips(parent, stage.faceted ? "subplots" : "tasks", stage.subplots.map((name) => ({ key: name, label: name })), choice.subplots);
   chips(parent, "conditions", stage.conditions, choice.conditions);
   parent.classList.toggle("tall", parent.offsetHeight > innerHeight / 5);
+  focusable()[focused]?.focus();
 }
 
 // Tables -----------------------------------------------------------------------------------------
@@ -170,7 +173,7 @@ function controls() {
 const orders = new Map();
 
 function sortKey(cell) {
-  const text = cell.textContent.trim();
+  const text = cell.textContent.trim().replace(/^\d+% CI |^TOST |^unadjusted /, "");
   if (/^\d+(:\d\d)+$/.test(text)) return text.split(":").reduce((sum, part) => 60 * sum + +part, 0);
   const number = parseFloat(text.replaceAll(",", "").replace(/^[^\d.-]+/, ""));
   if (text === "–" || /^(not|no) /.test(text)) return Infinity;

@@ -7,7 +7,7 @@ import hashlib
 import statistics
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
 from itertools import takewhile
@@ -21,14 +21,13 @@ from music_rllib import names
 from music_rllib.report.charts import chart_data
 from music_rllib.report.figures.choice import COST, GROUPS, PERFORMANCE, PRIMARY, Drawing, slug
 from music_rllib.report.figures.draw import inline
-from music_rllib.report.two_sweeps import titles_of
 from music_rllib.report.videos import Videos
 from music_rllib.results.analysis import StageAnalysis
 from music_rllib.results.answer import answer, planned_in_words
 from music_rllib.results.conditions import SIDE_BY_SIDE, StageRuns
 from music_rllib.results.data import Sweep
 from music_rllib.results.search_tables import search_in_words, search_tables
-from music_rllib.results.study import Study, study_of
+from music_rllib.results.study import Study
 from music_rllib.results.tables import DASH, Code, Seconds, Table, performance_tables, study_tables
 
 # The page may fetch nothing and run only its own script, whatever text a sweep puts into it.
@@ -64,8 +63,8 @@ class SweepReport:
 
     sweep: Sweep
     analyses: Sequence[StageAnalysis]
-    study: Study
-    """The planned comparisons and all others."""
+    studies: Mapping[str, Study]
+    """The planned comparisons and all others; of two sweeps by the start of their titles."""
     both: tuple[Sweep, Sweep] | None = None
     """The two sweeps that `sweep` consists of, in a report on two sweeps."""
     drawings: Sequence[Drawing]
@@ -77,15 +76,20 @@ class SweepReport:
     differences: Sequence[Table] = ()
     """Tables of the differences of two sweeps."""
 
+    @property
+    def study(self) -> Study:
+        """The study of a single sweep."""
+        return self.studies[""]
+
     @cached_property
     def answer(self) -> Sequence[str]:
         """The study in sentences, the question first; of two sweeps, questions and verdicts."""
         if self.both is None:
             return answer(self.sweep, self.study)
         found: list[str] = []
-        for title, sweep in zip(titles_of(*self.both), self.both, strict=True):
-            verdicts = takewhile(_is_no_detail, answer(sweep, study_of(sweep)))
-            found += [f"{title}: {line}" for line in verdicts]
+        for sweep, (title, study) in zip(self.both, self.studies.items(), strict=True):
+            verdicts = takewhile(_is_no_detail, answer(sweep, study))
+            found += [f"{title}{line}" for line in verdicts]
         return found
 
 
@@ -132,7 +136,7 @@ def render(report: SweepReport, *, live: bool = False) -> str:
         details=[*sentences[claims:], *planned] if sentences else [],
         numbers=numbers,
         pictures={drawing.name: inline(drawing) for drawing in report.drawings},
-        large=_large_figure(report, list(numbers)),
+        large=_large_figure(report, list(numbers), data["main"]),
         groups=list(_groups(report)),
         differences=report.differences,
         searches=[
@@ -199,9 +203,11 @@ def _question(report: SweepReport) -> str:
 # Figures and tables -----------------------------------------------------------------------------
 
 
-def _large_figure(report: SweepReport, stages: Sequence[str]) -> Mapping[str, Any] | None:
+def _large_figure(
+    report: SweepReport, stages: Sequence[str], main: int
+) -> Mapping[str, Any] | None:
     """Learning curves of the primary metrics: of all stages together, or of the last stage."""
-    shown = [stage for stage in stages if stage == SIDE_BY_SIDE] or stages[-1:]
+    shown = stages[main : main + 1]
     drawings = [d for d in report.drawings if d.stage in shown and d.title in PRIMARY]
     # The reader selects its metric.
     return {**_figure("Learning curves", drawings), "metric": ""} if drawings else None
@@ -210,7 +216,12 @@ def _large_figure(report: SweepReport, stages: Sequence[str]) -> Mapping[str, An
 def _groups(report: SweepReport) -> Iterable[Mapping[str, Any]]:
     """Figures, tables and remarks under each heading that has any."""
     stages = {drawing.stage for drawing in report.drawings if drawing.stage != SIDE_BY_SIDE}
-    performance = [*study_tables(report.study), *performance_tables(report.analyses)]
+    compared = [
+        replace(table, title=f"{title}{table.title}", name=table.name if not title else "")
+        for title, study in report.studies.items()
+        for table in study_tables(study)
+    ]
+    performance = [*compared, *performance_tables(report.analyses)]
     tables = {
         PERFORMANCE: performance if report.analyses else [],
         COST: [budget_table(report.sweep, report.analyses), failures_table(report.sweep)],

@@ -110,7 +110,7 @@ def _runs(sweep: Sweep, keys: list[str]) -> pd.DataFrame:
             {
                 **{name: getattr(run, name) for name in ("name", "stage", "variant", "task")},
                 "condition": labels[position],
-                "seed": run.seed,
+                "seed": run.seed or None,
                 **{name: _at_start(sweep, position, name) for name in _SETTINGS},
                 "status": run.status,
                 "started": run.started,

@@ -125,10 +125,12 @@ def to_csv(rows: Sequence[Mapping[str, object]]) -> str:
 
 
 def _plain(value: object) -> object:
-    """`0 1 2` for a list, and `0:0.5 1:0.6` for a mapping."""
+    """`0 1 2` for a list, and `0:0.5 1:0.6` for a mapping; without separators of thousands."""
     if isinstance(value, Mapping):
         return " ".join(f"{key}:{one!r}" for key, one in value.items())
-    return " ".join(map(str, value)) if isinstance(value, list) else value
+    return (
+        " ".join(str(one).replace(",", "") for one in value) if isinstance(value, list) else value
+    )
 
 
 def _cell(value: object) -> Cell:
@@ -158,6 +160,8 @@ def _number(value: float) -> str:
     if isinstance(value, Seconds):
         minutes, seconds = divmod(round(value), 60)
         return f"{minutes // 60}:{minutes % 60:02d}:{seconds:02d}"
+    if 0 < abs(value) < 0.01:
+        return f"{value:.2g}"
     return "not reached" if math.isinf(value) else number(value)
 
 
@@ -238,7 +242,10 @@ def performance_tables(analyses: Sequence[StageAnalysis]) -> list[Table]:
         Table(
             name="final",
             title="Final values",
-            header=("Stage", "Task", "Condition", "Metric", "Mean", "Each seed", "Seeds", "Runs"),
+            header=(
+                *("Stage", "Task", "Condition", "Metric", "Mean", "Each seed", "Seeds"),
+                "Finished",
+            ),
             rows=[
                 (
                     analysis.stage.name,

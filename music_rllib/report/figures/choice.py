@@ -291,11 +291,15 @@ def _styles_by_q(conditions: Sequence[Condition]) -> dict[str, Style]:
 # The study --------------------------------------------------------------------------------------
 
 
-def study_drawings(study: Study) -> Iterator[Drawing]:
-    """Differences with intervals, the profile of the primary metric, and its dependence on α."""
+def study_drawings(study: Study, title: str = "") -> Iterator[Drawing]:
+    """Differences with intervals, the profile of the primary metric, and its dependence on α.
+
+    Stages begin with `title`.
+    """
     if study.stage is None or not study.means:
         return
-    yield from _differences(study, study.stage.name)
+    stage = f"{title}{study.stage.name}"
+    yield from _differences(study, stage)
     styles, kind = styles_of(study.stage.compared), study.means[0].measure.kind_in_words
     shown = {mean.condition: styles[mean.condition] for mean in study.means}
     rates = [mean for mean in study.means if mean.measure.is_rate]
@@ -306,9 +310,10 @@ def study_drawings(study: Study) -> Iterator[Drawing]:
         if 1 < len(means) <= MOST_CONDITIONS
     ]:
         yield Drawing(
-            stage=study.stage.name,
+            stage=stage,
             title=f"Performance profile of the {kind}",
-            caption="Share of finished runs above each value, with pointwise 95% bands.",
+            caption="Share of runs above each value, with pointwise 95% bands. A failed run counts "
+            "with 0.",
             subplots=tuple(profiles),
             legend=[(condition.short_label, style) for condition, style in shown.items()],
         )
@@ -317,7 +322,7 @@ def study_drawings(study: Study) -> Iterator[Drawing]:
         of_lines = styles_of(tuple(dict.fromkeys(alike)))
         drawn = [(line, of_lines[one]) for line, one in zip(lines, alike, strict=True)]
         yield Drawing(
-            stage=study.stage.name,
+            stage=stage,
             title=f"{kind.capitalize()} against α",
             group=SETTINGS,
             caption="Mean over the seeds with its 95% band. A comparison at one value of α is the "

@@ -121,7 +121,7 @@ def drawn_figure(subplots: Sequence[Subplot], legend: Legend, width: float) -> F
     for axes in grid.flat[len(subplots) :]:
         axes.set_axis_off()
     for axes, subplot in zip(grid.flat, chain(*rows), strict=False):
-        axes.set_title(subplot.title)
+        axes.set_title(_wrapped(subplot.title, 0.8 * width / columns))  # its letters are larger
         axes.patch.set_alpha(0.0)
         subplot.draw(axes)
         axes.set_xlabel(_wrapped(axes.get_xlabel(), width / columns))

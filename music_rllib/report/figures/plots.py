@@ -268,12 +268,12 @@ def differences_subplot(title: str, rows: Sequence[tuple[str, Claim]], axis: str
     """Differences of labelled claims with their 95% and 90% CIs, over the equivalence margin."""
 
     def draw(axes: Axes) -> None:
-        ink, margin = mpl.rcParams["axes.edgecolor"], rows[0][1].margin
+        ink = mpl.rcParams["axes.edgecolor"]
         axes.axvline(0.0, color=ink, lw=0.8)
-        if margin is not None:
-            axes.axvspan(-margin, margin, color=_UNKNOWN, alpha=0.15, lw=0)
         for row, (_, claim) in enumerate(rows):
             q, gap = claim.pairs[0][0].entropic_index, claim.contrast.difference
+            if claim.margin is not None:
+                axes.barh(row, 2 * claim.margin, 1, -claim.margin, color=_UNKNOWN, alpha=0.15, lw=0)
             for one, width in ((gap, 1.5), (claim.contrast.within, 5)):
                 ends = [float(one.lower), float(one.upper)]
                 axes.plot(ends, [row, row], color=color_of(q), lw=width, alpha=0.6)
