@@ -134,6 +134,9 @@ def test_every_control_works_with_the_keyboard(open_page: Callable[[], Page], pa
                     break
             controls = [one for one in seen if one[0] in ("SELECT", "INPUT", "BUTTON")]
             assert len(controls) >= wanted > 3
+            await tab.evaluate("document.querySelector('#controls select').focus()")
+            await tab.evaluate("controls()")
+            assert (await tab.evaluate(FOCUSED))[0] == "SELECT"
 
     asyncio.run(use())
 
@@ -185,6 +188,17 @@ def test_selections_change_the_curves(open_page: Callable[[], Page], page: Path)
             assert rising == sorted(rising)
             await tab.evaluate(button)
             assert await tab.evaluate(order) == rising[::-1]
+            for cell, key in (("95% CI -0.06 to 0.00", -0.06), ("TOST p < 0.001", 0.001)):
+                assert await tab.evaluate(f"sortKey({{textContent: '{cell}'}})") == key
+            ticks = await tab.evaluate("ticksOf(0, 0.00061, 3).map(([, text]) => +text)")
+            assert ticks == [0, 0.00025, 0.0005]
+            await tab.evaluate("location.hash = '#group-performance'")
+            await asyncio.sleep(0.3)
+            heading = await tab.evaluate(
+                "(({x, y, height}) => document.elementFromPoint(x + 5, y + height / 2).tagName)"
+                "(document.querySelector('#group-performance h2').getBoundingClientRect())"
+            )
+            assert heading == "H2", "the controls cover it"
             assert not tab.errors
 
     asyncio.run(use())
@@ -298,6 +312,13 @@ def test_the_live_page_updates_in_place(
             assert abs(await tab.evaluate("scrollY") - 700) < 150
             assert await tab.evaluate(DRAWN) >= 3
             assert "music-rllib stop tiny --storage" in await tab.wait_for("To stop it:")
+            command = "document.querySelector('#live code')"
+            await tab.evaluate(f"getSelection().selectAllChildren({command})")
+            write_state(tmp_path, 12_345, time.time())
+            await tab.wait_for("12,345 environment steps")
+            assert await tab.evaluate("getSelection().toString()") == await tab.evaluate(
+                f"{command}.textContent"
+            )
             assert not tab.errors
             assert all(url.startswith(address) for url in tab.requests)
 

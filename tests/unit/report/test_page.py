@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from html import unescape
 from html.parser import HTMLParser
-from itertools import product
+from itertools import pairwise, product
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -25,7 +25,7 @@ from matplotlib.collections import PolyCollection
 import music_rllib
 from music_rllib import names
 from music_rllib.report.build import WANTED, build_report, made_files, write_report
-from music_rllib.report.charts import _mean_at, curves_csv
+from music_rllib.report.charts import _mean_at, chart_data, curves_csv
 from music_rllib.report.figures.choice import (
     AGAINST_ENTROPY,
     EXPLORATION_AGAINST_ENTROPY,
@@ -659,12 +659,42 @@ def test_stages_that_train_for_the_task_share_a_figure() -> None:
 def test_success_by_chance_is_shown_only_if_no_stage_trains_for_the_task() -> None:
     def drawn(*stages: str) -> set[str]:
         report = build_report(of_stages(*stages))
-        found = {one.stage for one in report.drawings if one.metric is not None}
+        titles = ("Final success rate", AGAINST_ENTROPY)
+        found = {one.stage for one in report.drawings if one.metric or one.title in titles}
         assert {row[0] for row in performance_tables(report.analyses)[0].rows} == found
         return found
 
     assert drawn("pretrain", "plain") == {"plain"}
     assert drawn("pretrain") == {"pretrain"}
+
+
+@pytest.mark.parametrize("stages", [("plain", "pretrain"), ("pretrain", "plain")])
+def test_the_large_figure_is_of_a_stage_that_trains_for_the_task(stages: Sequence[str]) -> None:
+    sweep = of_stages(*stages)
+    moved = Points([names.EVAL_DISPLACEMENT], [20_000], [20_000], [0.1])
+    points = [
+        Points(*(one + more for one, more in zip(climbing(0.5), moved, strict=True)))
+        for _ in sweep.runs
+    ]
+    report = build_report(replace(sweep, history=columns(points)))
+    data = chart_data(report.sweep, report.drawings)
+    assert data["stages"][data["main"]]["name"] == "plain"
+    assert 'id="learning-curves"' in render(report)
+
+
+def test_a_condition_of_the_page_has_one_style() -> None:
+    report = build_report(of_stages(*STAGES))
+    found: dict[str, set[tuple[str, str]]] = {}
+    for stage in chart_data(report.sweep, report.drawings)["stages"]:
+        for one in stage["conditions"]:
+            found.setdefault(one["key"], set()).add((one["color"], one["dashes"]))
+    assert all(len(styles) == 1 for styles in found.values())
+    assert len({*map(tuple, found.values())}) == 4
+
+
+def test_small_values_keep_their_digits() -> None:
+    page = render(build_report(returning({"1": [0.005] * 5, "2": [0.003, 0.0031] * 2})))
+    assert row_of(page, "Reacher", "q = 2", "return")[:2] == ["0.003", "0.003 to 0.0031"]
 
 
 def test_files_are_the_same_in_several_processes(
@@ -699,11 +729,14 @@ def test_long_labels_of_axes_stay_inside_their_figure(width: float, font: int, c
         label = "mean success over 1,000,000 steps, pretraining included"
         axes.set(xlabel=f"{label} τ", ylabel=label)
 
+    title = "FetchPickAndPlace, intrinsic.reward = disagreement"
     with mpl.rc_context({"font.size": font}):
-        figure = drawn_figure([Subplot(title="FetchPush", draw=draw)] * count, [], width)
+        figure = drawn_figure([Subplot(title=title, draw=draw)] * count, [], width)
         figure.draw_without_rendering()
+    titles = [axes.title.get_window_extent() for axes in figure.axes]
+    assert all(one.x1 < other.x0 for one, other in pairwise(titles))
     for axes in figure.axes:
-        for label in (axes.xaxis.label, axes.yaxis.label):
+        for label in (axes.title, axes.xaxis.label, axes.yaxis.label):
             box, whole = label.get_window_extent(), figure.bbox
             assert whole.x0 <= box.x0 < box.x1 <= whole.x1
             assert whole.y0 <= box.y0 < box.y1 <= whole.y1

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import csv
 from dataclasses import replace
 from pathlib import Path
 
 from music_rllib import names
-from music_rllib.report.build import build_report
+from music_rllib.report.build import build_report, write_report
 from music_rllib.report.page import render
 from music_rllib.report.two_sweeps import joined_sweeps
 from music_rllib.results.archive import read_archive
 from music_rllib.results.statistics import Estimate
+from tests.unit.report.test_page import compared
 
 DATA = Path(__file__).parents[3] / "docs" / "results" / "data"
 
@@ -69,6 +71,20 @@ def test_both_sweeps_have_an_answer() -> None:
     for name in ("proof-fetch-reach", "a"):
         assert sum(line.startswith(f"{name}: ") for line in made.answer) >= 2
     assert "How do proof-fetch-reach and a differ?" in render(made)
+
+
+def test_both_sweeps_have_comparisons(tmp_path: Path) -> None:
+    first = compared({"1": [0.5, 0.6], "1.5": [0.6, 0.7]})
+    second = replace(compared({"1": [0.2, 0.3], "2": [0.4, 0.4]}), name="other")
+    made = build_report(joined_sweeps(first, second), both=(first, second))
+    stages = {d.stage for d in made.drawings if d.title == "Differences"}
+    assert stages == {"smoke: finetune", "other: finetune"}
+    page = write_report(made, tmp_path).read_text()
+    for title in ("smoke", "other"):
+        assert f"<h3>{title}: Comparisons by the area under the curve" in page
+    rows = csv.DictReader((tmp_path / "tables/comparisons.csv").read_text().splitlines())
+    pairs = [(row["sweep"], row["first"]) for row in rows]
+    assert pairs == [("smoke", "q = 1.5"), ("other", "q = 2")]
 
 
 def test_missing_runs_are_reported_with_their_sweep() -> None:
