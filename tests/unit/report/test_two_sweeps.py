@@ -74,7 +74,7 @@ def test_both_sweeps_have_an_answer() -> None:
 
 
 def test_both_sweeps_have_comparisons(tmp_path: Path) -> None:
-    first = compared({"1": [0.5, 0.6], "1.5": [0.6, 0.7]})
+    first = compared({"1": [0.5, 0.6], "1.5": [0.6, 0.8]})
     second = replace(compared({"1": [0.2, 0.3], "2": [0.4, 0.4]}), name="other")
     made = build_report(joined_sweeps(first, second), both=(first, second))
     stages = {d.stage for d in made.drawings if d.title == "Differences"}
