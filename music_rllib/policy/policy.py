@@ -123,7 +123,7 @@ def load_policy(place: str | Path, env: str | Sequence[Task] = ()) -> Policy:
         with _local_copy(text) as found:
             return (_from_file if found.is_file() else policy_from_folder)(found, env)
     except (HandoffError, StorageError, PolicyFileError, OSError) as error:
-        raise PolicyError(f"{text} must hold a policy: {error}") from error
+        raise PolicyError(redact(f"{text} must hold a policy: {error}")) from error
 
 
 def policy_from_folder(folder: Path, env: str | Sequence[Task] = ()) -> Policy:
@@ -245,8 +245,11 @@ def _from_mlflow(uri: str, env: str | Sequence[Task]) -> Policy:
             return policy_from_folder(Path(model), env)
     except MlflowException as error:
         raise PolicyError(
-            f"{uri} must be a model at {mlflow.get_tracking_uri()} (MLFLOW_TRACKING_URI): {error}"
-        ) from error
+            redact(
+                f"{uri} must be a model at {mlflow.get_tracking_uri()} (MLFLOW_TRACKING_URI): "
+                f"{error}"
+            )
+        ) from None  # its message may hold a password
 
 
 @contextlib.contextmanager

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +20,7 @@ from music_rllib.envs.values import (
     observation_sizes,
     success_of,
 )
+from music_rllib.errors import reason_of
 from music_rllib.policy.policy import Policy, PolicyError, unknown_environment
 
 
@@ -59,8 +60,10 @@ def open_task(policy: Policy, **options: Any) -> Env:
         raise PolicyError(unknown_environment(policy.task))
     try:
         env = make_env(known.env_id, **{**known.kwargs, **options})
-    except (gym.error.Error, ImportError, TypeError) as error:
-        raise PolicyError(f"the environment {known.env_id} must be there: {error}") from error
+    except Exception as error:  # of the user's own constructor
+        raise PolicyError(
+            f"the environment {known.env_id} must be there: {reason_of(error)}"
+        ) from error
     try:
         _check_fit(policy, env)
     except ValueError as error:
@@ -97,26 +100,34 @@ def play(
         yield _episode(policy, env, reset_seed(entropy, policy.task.seed_range), on_step)
 
 
+@contextlib.contextmanager
+def _named(env: Env, seed: int, step: int) -> Iterator[None]:
+    """Name the episode and the step in an error of the environment."""
+    try:
+        yield
+    except Exception as error:  # of the user's own code
+        place = f"{name_of(env)}, episode with seed {seed}, step {step}"
+        raise PolicyError(f"{place}: {reason_of(error)}") from error
+
+
 def _episode(
     policy: Policy, env: Env, seed: int, on_step: Callable[[EpisodeStep], None] | None
 ) -> EpisodeResult:
-    observation, _ = env.reset(seed=seed)
+    with _named(env, seed, 0):
+        observation, _ = env.reset(seed=seed)
     first, total, successes = _surroundings(policy, observation), 0.0, []
     if on_step:
         on_step(EpisodeStep(env, 0, None, _distance(observation)))
     steps = 0
     for steps in range(1, policy.max_episode_steps + 1):
-        # A bound may lie between two numbers of the policy's precision.
-        bounds = check_action_space(env.action_space)
-        action = np.clip(policy.act(observation).astype(bounds.dtype), bounds.low, bounds.high)
-        observation, reward, terminated, truncated, info = env.step(action)
-        try:
+        with _named(env, seed, steps):
+            # A bound may lie between two numbers of the policy's precision.
+            bounds = check_action_space(env.action_space)
+            action = np.clip(policy.act(observation).astype(bounds.dtype), bounds.low, bounds.high)
+            observation, reward, terminated, truncated, info = env.step(action)
             total += number_of(reward, "reward")
             success = success_of(info, policy.task.success_key, missing=False)
             ends = flag_of(terminated, "terminated") or flag_of(truncated, "truncated")
-        except ValueError as error:
-            place = f"{name_of(env)}, episode with seed {seed}, step {steps}"
-            raise PolicyError(f"{place}: {error}") from error
         if success is not None:
             successes.append(success)
         if on_step:

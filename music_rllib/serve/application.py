@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import os
 from ipaddress import ip_address
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,7 +22,7 @@ from ray.serve.config import BackpressureConfig
 
 from music_rllib.policy import Policy, PolicyNetwork, find_policy, load_policy
 from music_rllib.runtime.process import give_back_freed_memory
-from music_rllib.serve import TOKEN_VARIABLE
+from music_rllib.serve import TOKEN_VARIABLE, given_token
 from music_rllib.serve.api import Array, PolicyFacts, Rows, compute, make_api, token_hash
 
 TOGETHER = 64
@@ -72,9 +71,10 @@ def application(policy: Policy, settings: ServeSettings) -> Application:
     """The application of a loaded policy.
 
     Raises:
+        BadInputError: No client can send the token.
         ValueError: A token is required and there is none.
     """
-    token = os.environ.get(TOKEN_VARIABLE)
+    token = given_token()
     if settings.token_required and not token:
         raise ValueError(f"{TOKEN_VARIABLE} must be set in the environment for token_required")
     deployment: Any = PolicyServer

@@ -87,6 +87,11 @@ class NodeStore(SealedFolders):
         """Fingerprint of the environment that a finished run used; None if it is not recorded."""
         return environment_of(self.manifest(key))
 
+    def described(self, key: str) -> tuple[Fingerprint | None, str]:
+        """The environment of a finished run, and a hash of its history."""
+        manifest = self.manifest(key)
+        return environment_of(manifest), manifest.files[HISTORY].sha256[:16]
+
     def lines(self, key: str) -> tuple[bytes, dict[str, str], Fingerprint | None]:
         """The `HISTORY` of a finished run, and its code and environment as passed to `publish`."""
         manifest = self.manifest(key)

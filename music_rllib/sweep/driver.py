@@ -165,8 +165,9 @@ def run(
                     clean.remove_started(opened.store, started, warn)
                 _check(opened)
                 tracker = stack.enter_context(open_tracker(opened))
-                for retrained in again:
-                    tracker.forget(retrained.key)
+                retrained = [*(run.key for run in again), *(node["key"] for node in started)]
+                for key in (*retrained, *opened.damaged):
+                    tracker.forget(key)
                 keep_record(opened)
                 has_begun = True  # what is to be retrained is recorded
                 plans = _record_analysis_plan(console, opened)

@@ -48,13 +48,13 @@ SCHEMA_SECONDS = 120.0
 _LASTING_ERRORS = frozenset(
     {
         "INVALID_PARAMETER_VALUE",
-        "BAD_REQUEST",
         "INVALID_STATE",
         "RESOURCE_DOES_NOT_EXIST",
         "NOT_FOUND",
-        "ENDPOINT_NOT_FOUND",
     }
 )
+_UNCLEAR_ERRORS = frozenset({"BAD_REQUEST", "ENDPOINT_NOT_FOUND"})
+"""Of a refused value, and also of a proxy without a server and of a database that is away."""
 Status = Literal["FINISHED", "FAILED", "KILLED"]
 
 _HINTS = {
@@ -68,6 +68,11 @@ _HINTS = {
 def is_lasting(error: Exception) -> bool:
     """Whether a retry cannot succeed: MLflow refuses the value, or the run was deleted."""
     return isinstance(error, MlflowException) and error.error_code in _LASTING_ERRORS
+
+
+def is_unclear(error: Exception) -> bool:
+    """Whether only further attempts show if a retry can succeed."""
+    return isinstance(error, MlflowException) and error.error_code in _UNCLEAR_ERRORS
 
 
 def mlflow_reason(error: Exception) -> str:
@@ -133,23 +138,24 @@ class Experiment:
     # -- finding and creating runs -----------------------------------------------------------
 
     def find(
-        self, node_key: str, environment: str | None = None, *, again: bool = False
+        self, node_key: str, identity: Mapping[str, str] = {}, *, again: bool = False
     ) -> KnownRun | None:
         """The run of a node, or the parent run ("").
 
         Lists all runs of the sweep on the first call, and looks for an unknown one `again`. A run
-        of another environment is deleted (it can be restored), because a new run replaces it.
+        that has one of the tags of `identity` with another value is deleted (it can be restored),
+        because a new run replaces it.
         """
-        if self.known is None:
-            self.known = self._list()
-        elif again and node_key and node_key not in self.known:
-            self.known |= self._list(f" AND tags.`{names.TAG_NODE_KEY}` = '{node_key}'")
-        known = self.known.get(node_key)
-        found = known.tags.get(names.TAG_ENVIRONMENT) if known else None
-        if environment and found not in (None, environment):
+        known = self.known
+        if known is None:
+            self.known = known = self._list()
+        elif again and node_key and node_key not in known:
+            known |= self._list(f" AND tags.`{names.TAG_NODE_KEY}` = '{node_key}'")
+        run = known.get(node_key)
+        if run and any(run.tags.get(tag, value) != value for tag, value in identity.items()):
             self.delete(node_key)
             return None
-        return known
+        return run
 
     def delete(self, node_key: str) -> None:
         """Delete a node's run, if there is one, so that it can still be restored."""
@@ -221,6 +227,13 @@ class Experiment:
             wanted.append((run, tags if node_key else current))
         for run, tags in wanted:
             self.correct(run, tags)
+            if tags is superseded and run.status == "RUNNING":
+                self._end_abandoned(run.run_id)
+
+    def _end_abandoned(self, run_id: str) -> None:
+        """End a run whose driver was killed, unless it has ended since it was listed."""
+        if self.client.get_run(run_id).info.status == "RUNNING":
+            self.client.set_terminated(run_id, "KILLED")
 
     def correct(self, run: KnownRun, tags: Mapping[str, str]) -> None:
         """Set those of the tags of an existing run that it has otherwise or not at all."""
@@ -233,6 +246,14 @@ class Experiment:
             if not is_lasting(error):  # otherwise the run was deleted
                 raise
         run.tags.update(changed)
+
+    def remove_tag(self, run_id: str, tag: str) -> None:
+        """Remove a tag, also if it was removed before and the response was lost."""
+        try:
+            self.client.delete_tag(run_id, tag)
+        except MlflowException as error:
+            if error.error_code != "RESOURCE_DOES_NOT_EXIST":
+                raise
 
     # -- one run -----------------------------------------------------------------------------
 
@@ -252,7 +273,7 @@ class Experiment:
         fresh = {name: value for name, value in params.items() if name not in run.data.params}
         self.log(run_id, tags=tags, params=fresh)
         for tag in {names.TAG_FAILURE, names.TAG_PRUNED} & run.data.tags.keys() - tags.keys():
-            self.client.delete_tag(run_id, tag)
+            self.remove_tag(run_id, tag)
         if run.info.status != "RUNNING":
             self.client.update_run(run_id, status="RUNNING")
 

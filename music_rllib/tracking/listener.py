@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 
 from music_rllib import names
@@ -59,7 +60,9 @@ class MlflowListener(Listener):
             self._mirror(node)
 
     def _mirror(self, node: Node) -> None:
-        info = run_info(node, self._store.environment(node.key))
+        environment, result = self._store.described(node.key)
+        info = run_info(node, environment)
+        info = replace(info, tags={**info.tags, names.TAG_RESULT: result})
         self.tracker.mirror(info, partial(finished_run, self._store, node))
 
     def left(self, node: Node, holder: str) -> None:

@@ -67,6 +67,8 @@ class RunQueue:
         self.node_key = node_key
         self.refused: str | None = None
         """Reason of a lasting failure, after which nothing more is sent."""
+        self.unclear = 0
+        """Number of failures in a row that may pass or not."""
         self.is_running = False
         """Whether the run has started and not ended."""
         self._experiment, self._sweep_tags, self._added = experiment, sweep_tags, added
@@ -142,16 +144,22 @@ class RunQueue:
                 self._log([record for record in records if isinstance(record, Report)])
             self._remove(records)
 
-    def attach(self, started: int | None = None, tags: Mapping[str, str] = {}) -> KnownRun:
+    def attach(
+        self, started: int | None = None, tags: Mapping[str, str] = {}, *, anew: bool = False
+    ) -> KnownRun:
         """The run in MLflow, which is found there or created.
 
         Args:
             started: Start time of a run that is created, in ms since the epoch; by default now.
             tags: Further tags of a run that is created.
+            anew: Whether to replace a complete run, because its node is trained again.
         """
         if self._run is None:
             again = started is None  # another driver may have begun the run meanwhile
-            run = self._experiment.find(self.node_key, self._environment, again=again)
+            run = self._experiment.find(self.node_key, self._identity, again=again)
+            if run is not None and anew and run.is_complete:
+                self._experiment.delete(self.node_key)
+                run = None
             if run is None:
                 name, time = self._info.name, started or _now()
                 all_tags = {**self._tags(), **tags}
@@ -176,6 +184,7 @@ class RunQueue:
                     self._records.popleft()
 
     def _send_start(self) -> None:
+        self.attach(anew=bool(self.node_key))
         params, tags = self._begin()
         self._experiment.log(self.attach().run_id, params=params, tags=tags)
         self._is_new, self._has_begun = False, True
@@ -200,7 +209,7 @@ class RunQueue:
         self._experiment.client.set_terminated(run_id, status, time)
 
     def _send_stored(self, read: Callable[[], StoredRun]) -> None:
-        known = self._experiment.find(self.node_key, self._environment)
+        known = self._experiment.find(self.node_key, self._identity)
         if self._run is None and known is not None and known.is_complete:
             self._run, self._read_policy = known, None
             # A stage may have another name since, and a trial another number.
@@ -225,7 +234,7 @@ class RunQueue:
         run_id = self.attach().run_id
         if (policy := self._read_policy()) is not None:
             self._experiment.log_policy(run_id, policy, self._tags())
-        self._experiment.client.delete_tag(run_id, names.TAG_INCOMPLETE)
+        self._experiment.remove_tag(run_id, names.TAG_INCOMPLETE)
 
     def _log(
         self,
@@ -259,9 +268,10 @@ class RunQueue:
             self._last_steps.update((metric.key, metric.step) for metric in chunk)
 
     @property
-    def _environment(self) -> str | None:
-        value = self._info.tags.get(names.TAG_ENVIRONMENT)
-        return None if value is None else str(value)
+    def _identity(self) -> dict[str, str]:
+        """The tags that a run of other numbers has with other values."""
+        found = {tag: self._info.tags.get(tag) for tag in (names.TAG_ENVIRONMENT, names.TAG_RESULT)}
+        return {tag: str(value) for tag, value in found.items() if value is not None}
 
     def _tags(self) -> dict[str, str]:
         """The run's tags, with the MLflow run that it starts from as soon as that is known."""

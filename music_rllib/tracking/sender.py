@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from threading import Thread
 
 from music_rllib.store.storage import DamagedError
-from music_rllib.tracking.client import is_lasting, mlflow_reason
+from music_rllib.tracking.client import is_lasting, is_unclear, mlflow_reason
 from music_rllib.tracking.run_queue import RunQueue
 
 logger = logging.getLogger(__name__)
@@ -20,6 +20,8 @@ SAY_SECONDS = 5.0
 """Time between two messages about the records that are left."""
 GATHER_SECONDS = 0.2
 """Wait before each round, so that one request takes several reports."""
+MOST_UNCLEAR = 12
+"""Number of unclear failures in a row after which a run is refused; minutes, with the pauses."""
 FIRST_PAUSE = 0.5
 LONGEST_PAUSE = 30.0
 
@@ -146,7 +148,8 @@ class Sender(Thread):
 
     def _send_each(self, runs: Iterable[RunQueue], policies: bool) -> None:
         """Send to several runs at once; no more after a failure."""
-        left = deque(run for run in runs if run.records and not (policies and run.is_running))
+        waiting = (run for run in runs if run.records and run.refused is None)
+        left = deque(run for run in waiting if not (policies and run.is_running))
 
         def send() -> None:
             while not (self._failed or self._stopped):
@@ -172,7 +175,9 @@ class Sender(Thread):
         # The thread must survive every error; unsent records stay in the queue.
         except Exception as error:
             reason = mlflow_reason(error)
-            if is_lasting(error) or isinstance(error, DamagedError):
+            run.unclear = run.unclear + 1 if is_unclear(error) else 0
+            lasts = is_lasting(error) or run.unclear >= MOST_UNCLEAR
+            if lasts or isinstance(error, DamagedError):
                 run.refused = reason
                 logger.warning("MLflow at %s does not get all of a run: %s", self._store, reason)
                 return
@@ -184,6 +189,8 @@ class Sender(Thread):
                 self._failures, self._error = self._failures + (not self._failed), reason
                 self._failed = True
                 self._runs[run] = self._runs.pop(run)
+        else:
+            run.unclear = 0
 
     def _pause(self) -> None:
         longest = FIRST_PAUSE if self._flushing else LONGEST_PAUSE

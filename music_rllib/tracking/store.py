@@ -234,9 +234,15 @@ def mlflow_version(store: TrackingStore) -> str | None:
 
 def _get(store: TrackingStore, page: str) -> requests.Response:
     import requests
+    from mlflow import environment_variables as mlflow_variables
 
-    url = f"{store.uri.rstrip('/')}/{page}"
-    return requests.get(url, timeout=(CONNECT_SECONDS, ANSWER_SECONDS))
+    insecure = mlflow_variables.MLFLOW_TRACKING_INSECURE_TLS.get()
+    return requests.get(
+        f"{store.uri.rstrip('/')}/{page}",
+        timeout=(CONNECT_SECONDS, ANSWER_SECONDS),
+        verify=not insecure and (mlflow_variables.MLFLOW_TRACKING_SERVER_CERT_PATH.get() or True),
+        cert=mlflow_variables.MLFLOW_TRACKING_CLIENT_CERT_PATH.get(),
+    )
 
 
 def _checked_scheme(uri: str) -> str:

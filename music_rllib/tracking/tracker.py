@@ -96,12 +96,10 @@ class Tracker:
         self._name, self._place = sweep_name, below(redact(storage), sweep_name)
         record = SweepRecord.read(storage, sweep_name)
         self.sweep_id = record.sweep_id if record else uuid.uuid4().hex[:16]
-        record = SweepRecord(
-            sweep_name=sweep_name,
-            sweep_id=self.sweep_id,
-            tracking_uri=None if tracking_uri is None else self.store.public_uri,
-        )
-        record.write(storage)  # before MLflow has anything that must be found again
+        uri = None if tracking_uri is None else self.store.public_uri
+        if record is None or record.tracking_uri != uri:
+            record = SweepRecord(sweep_name=sweep_name, sweep_id=self.sweep_id, tracking_uri=uri)
+            record.write(storage)  # before MLflow has anything that must be found again
         self._experiment = Experiment(self.store, sweep_name, self.sweep_id, _plan_key(config))
         # A SQLite file has one writer at a time.
         at_once = REQUESTS_AT_ONCE if self.store.is_server else 1
@@ -149,6 +147,7 @@ class Tracker:
 
     def leave(self, node_key: str) -> None:
         if (queue := self._runs.pop(node_key, None)) is not None:
+            queue.is_running = False  # the sender keeps it no longer
             queue.drop()
 
     def look_again(self) -> None:

@@ -23,12 +23,14 @@ from mlflow.models import Model
 from mlflow.tracking._tracking_service import utils as tracking_utils
 
 from music_rllib import names
+from music_rllib.errors import TrackingError
 from music_rllib.experiment.run_info import RunInfo
 from music_rllib.experiment.sweep_files import SweepLocation
 from music_rllib.policy import PolicyNetwork
 from music_rllib.store.history import Report
 from music_rllib.tracking.policy_model import write_model
 from music_rllib.tracking.run_queue import StoredRun
+from music_rllib.tracking.store import SweepRecord
 from music_rllib.tracking.tracker import SweepRun, Tracker
 from tests.integration.conftest import runs_by_name
 from tests.integration.mlflow_server import MlflowServer
@@ -173,6 +175,40 @@ def test_a_run_of_another_environment_replaces_the_earlier_one(
     assert logged(tracker) == [2000]
 
 
+def test_a_run_that_was_trained_again_replaces_the_complete_one(
+    storage: Path, tracker_on: MakeTracker
+) -> None:
+    """In this sweep, or in another sweep that shares the run."""
+
+    def logged(tracker: Tracker) -> list[tuple[int, float]]:
+        assert not tracker.close()
+        (run,) = (
+            r for r in runs_of(client_of(storage)).values() if names.TAG_NODE_KEY in r.data.tags
+        )
+        history = client_of(storage).get_metric_history(run.info.run_id, names.EVAL_SUCCESS)
+        return [(point.step, point.value) for point in history]
+
+    def of(result: str) -> RunInfo:
+        return run_info("a", tags={names.TAG_RESULT: result})
+
+    tracker = tracker_on()
+    tracker.mirror(of("1"), stored([2000, 4000]))
+    assert logged(tracker) == [(2000, 0.02), (4000, 0.04)]
+    again = [report(2000, {names.EVAL_SUCCESS: 0.5})]
+    tracker = tracker_on()
+    tracker.start(run_info("a"))
+    tracker.log("a", again)
+    assert tracker.flush(20.0)
+    tracker.mirror(of("2"), lambda: StoredRun(again))
+    assert logged(tracker) == [(2000, 0.5)]
+    tracker = tracker_on()
+    tracker.mirror(of("3"), stored([6000]))
+    assert logged(tracker) == [(6000, 0.06)]
+    tracker = tracker_on()
+    tracker.mirror(of("3"), stored([8000]))
+    assert logged(tracker) == [(6000, 0.06)], "MLflow has all of it"
+
+
 # An embedded store ------------------------------------------------------------------------------
 
 
@@ -275,6 +311,40 @@ def test_a_changed_plan_has_its_own_parent_run_and_current_runs(
     assert len(set(parents)) == 3
     assert parents[3] == parents[1]
     assert len(found) == 3 + 3, "each run is there once"
+
+
+def test_runs_of_a_killed_driver_end_when_they_leave_the_plan(
+    storage: Path, tracker_on: MakeTracker
+) -> None:
+    killed = tracker_on()
+    for key in ("a", "b"):
+        killed.start(run_info(key))
+    assert killed.flush(20.0)
+    killed._sender.stop()
+    tracker = tracker_on(config={"name": "smoke", "seeds": [0, 1]})
+    tracker.start(run_info("a"))
+    tracker.keep_current(["a"])
+    assert tracker.flush(20.0)
+    found = client_of(storage).search_runs([tracker.experiment_id])
+    states = sorted((run.info.run_name, run.info.status) for run in found)
+    assert states == [
+        *(("finetune/a", "RUNNING"), ("finetune/b", "KILLED")),
+        *(("smoke", "KILLED"), ("smoke", "RUNNING")),
+    ]
+
+
+def test_a_start_that_fails_keeps_the_sweeps_runs_in_mlflow(
+    storage: Path, tracker_on: MakeTracker
+) -> None:
+    tracker = tracker_on()
+    tracker.close()
+    client_of(storage).delete_experiment(tracker.experiment_id)
+    before = SweepRecord.read(str(storage), "smoke")
+    assert before is not None
+    assert before.run_id
+    with pytest.raises(TrackingError, match="must not be deleted"):
+        tracker_on()
+    assert SweepRecord.read(str(storage), "smoke") == before
 
 
 def test_another_driver_continues_the_runs_from_the_storage_alone(

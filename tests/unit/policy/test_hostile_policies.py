@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import traceback
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from music_rllib.config.load import declared_tasks
 from music_rllib.envs.make import known_environment
 from music_rllib.envs.tasks import BUILT_IN_TASKS, Task
 from music_rllib.policy import Policy, PolicyError, load_policy
-from music_rllib.policy.rollout import open_task
+from music_rllib.policy.rollout import open_task, play
 from music_rllib.program import main as sweep_main
 from music_rllib.store.handoff import HandoffError
 from music_rllib.store.handoff import read_handoff as read_handoff_of
@@ -84,6 +85,33 @@ def test_the_same_policy_of_a_known_environment_is_played(tmp_path: Path) -> Non
         load_policy(place, "Pendulum-v1")
     with pytest.raises(PolicyError, match="must fit the policy"):
         open_task(load_policy(write_policy(tmp_path / "reach", BUILT_IN_TASKS["FetchReach"])))
+
+
+def test_what_an_environment_does_in_an_episode_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy = load_policy(write_policy(tmp_path / "known", PENDULUM))
+    env = open_task(policy)
+
+    def unstable(action: object) -> None:
+        raise RuntimeError("simulator unstable")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(env.unwrapped, "step", unstable)
+        with pytest.raises(PolicyError, match="Pendulum.*step 1: simulator unstable"):
+            next(play(policy, env, 1, seed=0))
+    monkeypatch.setattr(env.unwrapped, "_get_obs", lambda: np.full(3, np.nan, np.float32))
+    with pytest.raises(PolicyError, match="finite"):
+        next(play(policy, env, 1, seed=0))
+    env.close()
+
+
+def test_a_password_is_not_in_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://alice:s3cr3tpw@127.0.0.1:9")
+    monkeypatch.setenv("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
+    with pytest.raises(PolicyError) as raised:
+        load_policy("models:/m-0123456789")
+    assert "s3cr3tpw" not in "".join(traceback.format_exception(raised.value))
 
 
 @pytest.mark.parametrize(

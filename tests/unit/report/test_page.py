@@ -671,12 +671,9 @@ def test_success_by_chance_is_shown_only_if_no_stage_trains_for_the_task() -> No
 @pytest.mark.parametrize("stages", [("plain", "pretrain"), ("pretrain", "plain")])
 def test_the_large_figure_is_of_a_stage_that_trains_for_the_task(stages: Sequence[str]) -> None:
     sweep = of_stages(*stages)
-    moved = Points([names.EVAL_DISPLACEMENT], [20_000], [20_000], [0.1])
-    points = [
-        Points(*(one + more for one, more in zip(climbing(0.5), moved, strict=True)))
-        for _ in sweep.runs
-    ]
-    report = build_report(replace(sweep, history=columns(points)))
+    metrics = [names.EVAL_SUCCESS, names.EVAL_DISPLACEMENT]
+    points = Points(metrics, [200_000] * 2, [0, 0], [0.5, 0.1])
+    report = build_report(replace(sweep, history=columns(points for _ in sweep.runs)))
     data = chart_data(report.sweep, report.drawings)
     assert data["stages"][data["main"]]["name"] == "plain"
     assert 'id="learning-curves"' in render(report)
