@@ -84,6 +84,9 @@ _SECRET_KEY = re.compile(rf"{_NAMES}|{_SHORT_NAMES}", re.I)
 _COUNTED_KEY = re.compile(r"tokens?", re.I)
 """A number under such a name is a count or an id."""
 _KEYED_BY_TASK = ("environments", "per_task")
+_OF_A_CLASS = ("env_id", "reward")
+_CLASS = re.compile(r"[\w.]+:[\w./-]+")
+"""A module and what it has: `token_world:TokenWorld-v0` has no secret."""
 _NOT_IN_A_NAME = re.compile(r"[^\w./\- ]")
 
 
@@ -145,8 +148,11 @@ def _clean(key: str, value: object) -> object:
     if isinstance(value, Mapping):
         return without_secrets(value, of_tasks=key in _KEYED_BY_TASK)
     if isinstance(value, (list, tuple)):
-        return [_clean("", item) for item in value]
-    return redact(value) if isinstance(value, str) else value
+        return [_clean(key, item) for item in value]
+    if not isinstance(value, str):
+        return value
+    names_a_class = key.rpartition(".")[2] in _OF_A_CLASS and _CLASS.fullmatch(value)
+    return value if names_a_class else redact(value)
 
 
 def flat_params(settings: Mapping[str, object]) -> dict[str, str]:

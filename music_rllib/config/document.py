@@ -259,29 +259,53 @@ def lay_overrides(document: Document, overrides: Mapping[str, Any]) -> None:
         ConfigError: One names a stage that does not exist, or a setting that a grid or search
             varies.
     """
-    for key, value in sorted(overrides.items(), key=_turn):
-        place: KeyPath = tuple(key.split("."))
+    left = dict(overrides)
+    if "stages" in left:
+        document.put(("stages",), left.pop("stages"))
+    places: dict[str, KeyPath] = {
+        key: _place_in_stage(document, key) if key.startswith("stages.") else (*key.split("."),)
+        for key in left
+    }
+    for key in sorted(left, key=lambda key: _turn(places[key])):
+        place, value = places[key], left[key]
         if place[0] in LAYER_KEYS:
             for stage in _stages(document):
                 _check_not_varied(stage, key, value)
-                tasks = find(stage, ("per_task",))
-                for layer in (stage, *(tasks.values() if isinstance(tasks, dict) else ())):
-                    if isinstance(group := find(layer, place[:-1]), dict):
-                        group.pop(place[-1], None)
+                _remove(place, stage, *_layers_of_tasks(stage))
             place = ("defaults", *place)
-        elif place[0] == "stages" and len(place) > 1:
-            place = _place_in_stage(document, key)
+        elif place[0] == "stages":
+            stage, setting = _stages(document)[int(place[1])], place[2:]
+            layers = _layers_of_tasks(stage)
+            if setting[0] == "per_task":
+                setting, layers = setting[2:], []
+            if setting and setting[0] in LAYER_KEYS:
+                is_group = setting[-1] in SECTIONS and isinstance(value, dict)
+                for one in [(*setting, name) for name in value] if is_group else [setting]:
+                    _check_not_varied(stage, ".".join(map(str, one)), value)
+                    _remove(one, *layers)
         document.put(place, value)
 
 
-def _turn(override: tuple[str, Any]) -> int:
+def _turn(place: KeyPath) -> int:
     """The turn of an override, in any order of the arguments: those of one stage come last.
 
     A new grid or search of a stage comes first: it decides which settings may be given.
     """
-    if not override[0].startswith("stages."):
+    if place[0] != "stages":
         return 1
-    return 0 if override[0].endswith((".grid", ".search")) else 2
+    return {"grid": 0, "search": 0, "per_task": 3}.get(str(place[2]), 2)
+
+
+def _layers_of_tasks(stage: Mapping[str, Any]) -> list[Any]:
+    tasks = find(stage, ("per_task",))
+    return [*tasks.values()] if isinstance(tasks, dict) else []
+
+
+def _remove(place: KeyPath, *layers: Any) -> None:
+    """Remove a setting that an override replaces."""
+    for layer in layers:
+        if isinstance(group := find(layer, place[:-1]), dict):
+            group.pop(place[-1], None)
 
 
 def _check_not_varied(stage: Mapping[str, Any], key: str, value: Any) -> None:

@@ -70,7 +70,7 @@ class _Range(_Dimension):
 
     def ends(self) -> tuple[Any, ...]:
         """Both ends; if they are valid settings, the range is valid."""
-        return self.bounds
+        return self.reachable
 
     @property
     def reachable(self) -> tuple[Any, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import random
+import sys
 from collections.abc import Iterator
 from typing import Any
 
@@ -18,7 +19,7 @@ class Beside(gym.Wrapper[Any, Any, Any, Any]):
         env: the environment.
         second: the other one.
         seed: seed of the second environment's episodes.
-        generators: whether they share the global random generators of NumPy and Python.
+        generators: whether they share the global random generators of NumPy, PyTorch and Python.
     """
 
     def __init__(
@@ -48,6 +49,10 @@ class Beside(gym.Wrapper[Any, Any, Any, Any]):
 def _kept_generators() -> Iterator[None]:
     """Restore the global random generators afterwards."""
     numpy_state, state = np.random.get_state(), random.getstate()  # noqa: NPY002
+    torch = sys.modules.get("torch")
+    torch_state = torch.get_rng_state() if torch else None
     yield
     np.random.set_state(numpy_state)  # noqa: NPY002
     random.setstate(state)
+    if torch:
+        torch.set_rng_state(torch_state)

@@ -29,9 +29,11 @@ import itertools
 import json
 import os
 import re
+import sys
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
+from importlib.machinery import PathFinder
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -256,9 +258,18 @@ def _package(name: str, file: Path) -> str:
 
 
 def _file_of(name: str) -> Path | None:
-    """The file of a module; None for built-in and missing ones."""
+    """The file of a module, which is not imported; None for built-in and missing ones."""
+    top, *rest = name.split(".")
     try:
-        spec = importlib.util.find_spec(name)
+        spec = importlib.util.find_spec(top)
+        for part in rest:
+            if spec is None:
+                return None
+            package = sys.modules.get(spec.name)
+            folders = getattr(package, "__path__", spec.submodule_search_locations)
+            if folders is None:  # `from module import name`
+                return None
+            spec = PathFinder.find_spec(f"{spec.name}.{part}", folders)
     except (ImportError, ValueError, AttributeError):
         return None
     file = Path(spec.origin) if spec and spec.has_location and spec.origin else None
@@ -313,8 +324,13 @@ def _files_of_arguments(arguments: Any) -> dict[str, str]:
     if isinstance(arguments, Mapping):
         arguments = list(arguments.values())
     if isinstance(arguments, list | tuple):
-        parts = map(_files_of_arguments, arguments)
-        return {name: value for part in parts for name, value in part.items()}
+        found: dict[str, str] = {}
+        parts = (_files_of_arguments(one).items() for one in arguments)
+        for name, value in itertools.chain(*parts):
+            # Files of different folders may have the same name.
+            other = found.get(name, value)
+            found[name] = value if other == value else _hash((other + value).encode())
+        return found
     if not isinstance(arguments, str) or len(arguments) > 1000 or "." not in arguments:
         return {}
     path = Path(arguments).expanduser()

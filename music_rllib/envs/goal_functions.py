@@ -111,12 +111,15 @@ def _problem_of(
     tolerance = 1e-5 * np.abs(together).max()
     if not np.abs(together - np.concatenate(alone)).max() <= tolerance:
         return _BY_ROW, "rewards change with the batch or the simulator"
-    played.finish(terminated=False)
+    reached = played.finish(terminated=False).frames[:, -len(start) :]
+    distances = [distance, float(np.linalg.norm(reached - reached[0], axis=1).max())]
     for number in range(_TRIED_EPISODES):  # one function computes the rewards of all episodes
-        env.reset(seed=reset_seed(np.random.SeedSequence(number), seed_range))
+        again = env.reset(seed=reset_seed(np.random.SeedSequence(number), seed_range))[0]
+        distances.append(_distance(again))
         if not np.abs(together - reward(achieved, desired)).max() <= tolerance:
             return _BY_GOALS, "rewards of the same goals change from episode to episode"
-    lost = lost_by_rounding(reward, start, distance)
+    # A goal may begin near the achieved one: those of hindsight lie as far away as the agent gets.
+    lost = lost_by_rounding(reward, start, max(distances))
     return (_KEPT, lost) if lost else None
 
 
@@ -126,12 +129,20 @@ def _goals_near(first: Any) -> tuple[NDArray[Any], float, Floats, Floats]:
     The achieved goals are all that of `first`; the desired ones lie from within any threshold to
     far beyond it.
     """
-    start, goal = (np.asarray(first[key], np.float64) for key in ("achieved_goal", "desired_goal"))
-    distance = float(np.linalg.norm(start - goal)) or 1.0
+    start = np.asarray(first["achieved_goal"], np.float64)
+    distance = _distance(first)
     achieved = np.tile(start.astype(np.float32), (_ROWS, 1))
     longest = max(1.0, distance)
     offsets = longest * random_offsets(_ROWS, len(start), 1e-3 / longest, 1.0)
     return start, distance, achieved, (achieved + offsets).astype(np.float32)
+
+
+def _distance(observation: Any) -> float:
+    """Distance of achieved and desired goal; 1 if they are equal."""
+    achieved, desired = (
+        np.asarray(observation[key], np.float64) for key in ("achieved_goal", "desired_goal")
+    )
+    return float(np.linalg.norm(achieved - desired)) or 1.0
 
 
 def _compute_terminated(env: Env) -> Any:
@@ -230,9 +241,12 @@ def augmentation_of(
     try:
         rewards = reward(achieved, desired)
     except Exception:
-        if known is None:  # without hindsight it need not be a function of goals
+        if known is None:
             return augmentation
         raise
+    # Without hindsight it need not be a function of goals.
+    if known is None and not np.array_equal(reward(achieved, desired), rewards):
+        return augmentation
     none = np.zeros(rows, np.float32)
     actions = np.zeros((rows, layout.action), np.float32)
     changed = Transitions(inputs[0], actions, none, none, inputs[1], None, np.arange(rows))

@@ -249,10 +249,11 @@ class Probe:
                 "symmetries change positions and no entry of the goal: give `goal`, too, unless "
                 "the goal is in other coordinates"
             )
-        reward = self._reward if symmetries.kinds else None
+        if not symmetries.kinds:
+            return
         try:
             augmentation_of(
-                symmetries, symmetries.kinds, self._layout, env, reward=reward, seed=seed
+                symmetries, symmetries.kinds, self._layout, env, reward=self._reward, seed=seed
             )
         except ValueError as error:
             self.problems.append(first_line(error))

@@ -199,7 +199,8 @@ def _check_own_class(batch: Batch, make: Callable[[], RewardLearner]) -> None:
                 raise ValueError(f"{kind} must not change the {name} of its batch in place")
         return rewards
 
-    with torch.random.fork_rng(devices=[]):
+    on_gpu = [batch.states.device] if batch.states.is_cuda else []
+    with torch.random.fork_rng(devices=on_gpu):
         first, resumed = make(), make()
         kind = type(first.reward).__name__
         learned(first)
@@ -209,9 +210,11 @@ def _check_own_class(batch: Batch, make: Callable[[], RewardLearner]) -> None:
             rule = f"{kind} must keep the shapes of its parameters and buffers"
             raise ValueError(f"{rule}, a checkpoint raised {one_line(error)}") from error
         # Layers such as dropout draw from PyTorch's own generator, which checkpoints keep.
-        begin = torch.get_rng_state()
+        begin = torch.get_rng_state(), [torch.cuda.get_rng_state(one) for one in on_gpu]
         rewards = learned(first)
-        torch.set_rng_state(begin)
+        torch.set_rng_state(begin[0])
+        for device, state in zip(on_gpu, begin[1], strict=True):
+            torch.cuda.set_rng_state(state, device)
         if not torch.equal(rewards, learned(resumed)):
             raise ValueError(
                 f"{kind} must keep everything that changes in parameters and buffers, and take "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Annotated, Literal, Self
@@ -76,7 +77,11 @@ class IntrinsicSettings(StrictModel):
                         f"settings of {self.reward} must be among: {', '.join(known) or 'none'}; "
                         f"got {name!r}"
                     )
-                if isinstance(value, bool) or not isinstance(value, int | float) or value <= 0:
+                if (
+                    isinstance(value, bool)
+                    or not isinstance(value, int | float)
+                    or not 0 < value < math.inf
+                ):
                     raise ValueError(f"settings.{name} must be a number > 0, got {value!r}")
                 if name in COUNTS:
                     least = COUNTS[name]

@@ -25,12 +25,8 @@ import psutil
 from filelock import FileLock
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from music_rllib.store.storage import (
-    StorageError,
-    StorageFolder,
-    must_be_writable,
-    write_atomically,
-)
+from music_rllib.store.files import write_atomically
+from music_rllib.store.storage import StorageError, StorageFolder, must_be_writable
 
 EXPIRES_SECONDS = 60.0
 """Time until a lease expires; the clocks of machines must agree better than that."""

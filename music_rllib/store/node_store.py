@@ -28,9 +28,10 @@ from typing import Any, TypeVar
 
 from music_rllib.envs.fingerprint import Fingerprint
 from music_rllib.errors import indented
+from music_rllib.store.files import write_atomically
 from music_rllib.store.history import HISTORY, Report, RunResult, from_json_lines, last_values
 from music_rllib.store.sealed import MANIFEST, Manifest, SealedFolders
-from music_rllib.store.storage import DamagedError, open_storage, write_atomically
+from music_rllib.store.storage import DamagedError, open_storage
 from music_rllib.store.work_folder import KEEP, WorkFolder, environment_of
 
 K = TypeVar("K")

@@ -24,13 +24,8 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue
 
 from music_rllib.errors import reason_of
 from music_rllib.limits import MOST_JSON_BYTES, open_regular, read_json
-from music_rllib.store.storage import (
-    DamagedError,
-    StorageFolder,
-    must_be_writable,
-    sync_folder,
-    write_atomically,
-)
+from music_rllib.store.files import sync_folder, write_atomically
+from music_rllib.store.storage import DamagedError, StorageFolder, must_be_writable
 
 MANIFEST = "manifest.json"
 _CHUNK = 1 << 20

@@ -10,7 +10,6 @@ import subprocess
 import sys
 import tempfile
 import unicodedata
-import uuid
 from collections.abc import Callable, Container, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ import pyarrow.fs as pafs
 
 from music_rllib.errors import BadInputError
 from music_rllib.redaction import redact
+from music_rllib.store.files import write_atomically
 from music_rllib.store.patience import patiently
 
 K = TypeVar("K")
@@ -65,41 +65,6 @@ def must_be_writable(path: str, codes: Container[int | None] | None = None) -> I
         raise StorageError(
             f"{error.filename or path} must be writable: {error.strerror or error}"
         ) from error
-
-
-def write_atomically(path: Path, data: bytes, *, sync: bool = True) -> None:
-    """Replace the content of `path`; a crash leaves either the old content or the new one.
-
-    The umask decides who may read the file. Without `sync`, a power cut may lose the content.
-
-    Raises:
-        OSError: The file cannot be written; the message names the path.
-    """
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}")
-    try:
-        with temporary.open("xb") as file:
-            file.write(data)
-            if sync:
-                file.flush()
-                os.fsync(file.fileno())
-        temporary.replace(path)
-    except BaseException as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-        if isinstance(error, OSError) and error.filename is None:
-            raise OSError(error.errno, error.strerror, str(path)) from error
-        raise
-    if sync:
-        sync_folder(path.parent)
-
-
-def sync_folder(folder: Path) -> None:
-    """Flush a folder's entries to the disk, so that a rename in it survives a power cut."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 @dataclass(frozen=True)

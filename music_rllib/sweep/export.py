@@ -25,8 +25,9 @@ from music_rllib.results.conditions import Condition
 from music_rllib.results.data import LastValues, RunRecord, Sweep
 from music_rllib.results.read import searches_of
 from music_rllib.search.best import best_so_far, best_text, condition_of, ranking_metric
+from music_rllib.store.files import write_atomically
 from music_rllib.store.handoff import MANIFEST as HANDOFF_FILE
-from music_rllib.store.storage import StorageError, is_remote, write_atomically
+from music_rllib.store.storage import StorageError, is_remote
 
 CHOSEN = "chosen.json"
 

@@ -115,6 +115,18 @@ def test_names_and_counts_of_tokens_are_kept() -> None:
     }
 
 
+def test_names_of_environments_and_rewards_are_kept() -> None:
+    """`resume` reads them; the value of another setting may be a password."""
+    kept = {
+        "environments": {"T": {"env_id": "token_world:TokenWorld-v0"}},
+        "grid": {"intrinsic.reward": ["cookie_rewards:Count", "rnd"]},
+    }
+    assert without_secrets(kept) == kept
+    hidden = {"env_id": "token_world:T-v0 password: hunter2", "note": "token:abcdefgh"}
+    assert "hunter2" not in str(without_secrets(hidden))
+    assert "abcdefgh" not in str(without_secrets(hidden))
+
+
 def test_params_are_flat_text() -> None:
     params = flat_params(
         {

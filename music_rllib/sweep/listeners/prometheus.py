@@ -17,8 +17,8 @@ from music_rllib import names
 from music_rllib.config.tac_settings import setting_text
 from music_rllib.experiment.plan import Node
 from music_rllib.experiment.scheduler import Failure, Listener, Scheduler, Status
+from music_rllib.store.files import write_atomically
 from music_rllib.store.history import Report, RunResult, last_values
-from music_rllib.store.storage import write_atomically
 from music_rllib.tracking.sender import Pending
 
 TARGETS = ".prometheus"

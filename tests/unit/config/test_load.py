@@ -466,6 +466,10 @@ BAD: list[tuple[Document, str]] = [
         "settings.ridge must be a number > 0, got 0",
     ),
     (
+        with_stage(0, intrinsic={"reward": "rnd", "settings": {"hidden": float("inf")}}),
+        "settings.hidden must be a number > 0, got inf",
+    ),
+    (
         with_stage(0, intrinsic={"reward": "rnd", "settings": {"hidden": 2.5}}),
         "settings.hidden must be a whole number >= 1, got 2.5",
     ),

@@ -109,6 +109,13 @@ def test_a_setting_of_one_stage_counts_in_any_order(tmp_path: Path) -> None:
         assert [run.tac.lr for run in runs(load(tmp_path, *given))] == [0.01, 0.02, 0.02]
 
 
+def test_a_setting_of_one_stage_replaces_those_of_its_tasks(tmp_path: Path) -> None:
+    first, second, _ = runs(load(tmp_path, "stages.first.tac.lr=0.01"))
+    assert (first.tac.lr, second.tac.lr) == (0.01, 0.002)
+    own = ("stages.first.per_task.FetchReach.tac.lr=0.02", "stages.first.tac.lr=0.01")
+    assert runs(load(tmp_path, *own))[0].tac.lr == 0.02
+
+
 SHARED = """
 name: mine
 tasks: [FetchReach]
@@ -212,6 +219,12 @@ REFUSED: list[tuple[str, str]] = [
     ("tac.hidden_sizes=[8, 0]", "command line: tac.hidden_sizes[1] must be > 0, got 0"),
     ("tac.entropic_index=2", "stages.second.grid.tac.entropic_index='[2]' replaces its values"),
     ("tac.entropic_index=[1, 2]", "grid.tac.entropic_index='[1, 2]' replaces its values"),
+    ("stages.second.tac.entropic_index=2", "second.grid.tac.entropic_index='[2]' replaces its"),
+    ("stages.second.tac={entropic_index: 2}", "where stages.second.grid.tac.entropic_index varies"),
+    (
+        "stages.second.per_task.FetchReach.tac.entropic_index=2",
+        "where stages.second.grid.tac.entropic_index varies",
+    ),
     ("tac.alpha=[.1, .2]", "belong in a stage's grid: {tac.alpha: [0.1, 0.2]}"),
     ("stages.third.env_steps=1", "must be stages.NAME.KEY, with NAME one of first, second"),
     ("stages.first.q=1", "stages.first.q is not a known setting (did you mean 'tac.entropic"),

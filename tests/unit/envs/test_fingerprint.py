@@ -107,6 +107,34 @@ def test_sources_models_and_packages_are_found(folder: Path) -> None:
     }
 
 
+def test_files_of_the_same_name_are_told_apart(
+    folder: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    outside = tmp_path_factory.mktemp("models")
+    files = [outside / name / "model.xml" for name in ("robots", "scenes")]
+    for file in files:
+        file.parent.mkdir()
+        file.write_text("<mujoco/>")
+
+    def of() -> Fingerprint:
+        return fingerprint_of("lab.envs:Lab-v0", {"files": [*map(str, files)]})
+
+    before = of()
+    for file in files:
+        changed = before
+        edited(file)
+        before = of()
+        assert differences(changed, before) == ["model.xml changed"]
+
+
+def test_a_module_that_is_imported_later_is_not_imported(folder: Path) -> None:
+    (folder / "lab_late.py").write_text("raise SystemExit('no display')\n")
+    base = folder / "lab/base.py"
+    base.write_text(base.read_text().replace("import lab_late", "from lab_late import Window"))
+    assert "source lab_late.py" in now(folder)
+    assert "lab_late" not in sys.modules
+
+
 def crlf(path: Path) -> None:
     path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))
 

@@ -136,6 +136,40 @@ def test_symmetries_without_the_goal_are_named(monkeypatch: pytest.MonkeyPatch) 
     assert "no entry of the goal" in remark
 
 
+class Progress(Sound):
+    """Its reward depends on the call before, which nothing but hindsight forbids."""
+
+    before = 0.0
+
+    def compute_reward(self, achieved: Any, desired: Any, info: Any) -> Any:
+        now = np.linalg.norm(achieved - desired, axis=-1)
+        before, self.before = self.before, float(np.mean(now))
+        return before - now
+
+
+def test_a_reward_of_more_than_goals_may_have_symmetries(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert probed(monkeypatch, Progress).problems == []
+    whole = {"mirror": {"positions": [0], "goal": [0], "action": [0]}}
+    assert probed(monkeypatch, Progress, symmetries=whole).problems == []
+
+
+class HoldIt(Sound):
+    """Goals begin a thousandth of a coordinate away from the achieved ones."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        _, info = super().reset(seed=seed)
+        self.at = self.at + 2.0
+        self.goal = self.at + self.np_random.uniform(-1e-4, 1e-4, 2)
+        return self.seen(), info
+
+    def compute_reward(self, achieved: Any, desired: Any, info: Any) -> Any:
+        return -np.linalg.norm(np.subtract(achieved, desired, dtype=np.float64), axis=-1)
+
+
+def test_goals_may_begin_near_the_achieved_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert probed(monkeypatch, HoldIt, hindsight=True).problems == []
+
+
 def bonus(env: Sound, seen: Any, reward: float, *rest: Any) -> Any:
     return seen, reward + 10.0 * (reward == 0), *rest
 
@@ -394,9 +428,19 @@ class GlobalGenerator(Sound):
         return super().step(action + np.random.uniform(-0.1, 0.1, 2))  # noqa: NPY002
 
 
+class TorchGenerator(Sound):
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        torch.manual_seed(seed or 0)
+        return super().reset(seed=seed)
+
+    def step(self, action: Any) -> Any:
+        return super().step(action + 0.1 * torch.randn(2).numpy())
+
+
 @pytest.mark.parametrize(
     ("kind", "remark"),
     [
+        (TorchGenerator, "beside a second environment it differed from step 1 on"),
         (GlobalGenerator, "beside a second environment it differed from step 1 on"),
         (Holds, "observation[1] holds desired_goal[1] or its distance from the achieved goal"),
         (FarAway, "observation[0] changes too little for its size: float32"),

@@ -146,6 +146,7 @@ def test_values_of_a_dimension(dimension: Document, inside: list[Any], outside: 
     found = SearchSettings.model_validate({"space": {"x": dimension}, "trials": 1}).space["x"]
     assert [value for value in inside if not found.contains(value)] == []
     assert [value for value in outside if found.contains(value)] == []
+    assert all(found.contains(end) for end in found.ends()), "a limit need not be a value"
     assert memory_of(lambda: found.contains(15)) < 100_000, "it must not create all values"
 
 

@@ -138,6 +138,13 @@ def test_weights_of_a_diverged_run_are_refused(tmp_path: Path) -> None:
         open_handoff(tmp_path)
 
 
+def test_a_buffer_of_a_reward_may_hold_infinity(tmp_path: Path) -> None:
+    lowest = np.array([np.inf, 0.5], np.float32)
+    write_handoff(tmp_path, {"intrinsic": {"lowest": lowest}}, INFO)
+    found = read_handoff(tmp_path, ["intrinsic"], PUSH)["intrinsic"]["lowest"]
+    np.testing.assert_array_equal(found, lowest)
+
+
 def test_the_content_hash_depends_on_weights_and_task_only(tmp_path: Path) -> None:
     def content_hash(name: str, weights: NetworkWeights, **changes: Any) -> str:
         info = INFO.model_copy(update=changes)

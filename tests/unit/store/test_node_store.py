@@ -14,6 +14,7 @@ import pytest
 from fsspec.implementations.memory import MemoryFileSystem  # type: ignore[import-untyped]
 
 from music_rllib.store import node_store, sealed
+from music_rllib.store.files import write_atomically
 from music_rllib.store.history import (
     HISTORY,
     Report,
@@ -25,13 +26,7 @@ from music_rllib.store.history import (
 from music_rllib.store.node_store import NodeStore
 from music_rllib.store.sealed import Manifest, SealedFolders
 from music_rllib.store.serialization import canonical_json
-from music_rllib.store.storage import (
-    DamagedError,
-    StorageError,
-    StorageFolder,
-    open_storage,
-    write_atomically,
-)
+from music_rllib.store.storage import DamagedError, StorageError, StorageFolder, open_storage
 from music_rllib.store.work_folder import steps_of
 
 KEY = "0123456789abcdef0123"
