@@ -28,6 +28,7 @@ PRETRAINING = ("MUSIC-u (pretraining)", Style("#9a9a9a", "o"))
 NOT_IN_THE_PICTURE = (
     "equal-entropy",
     "equal-entropy-fixed",
+    "equal-entropy-slide",
     "claims-pick-and-place",
     "claims-slide",
 )

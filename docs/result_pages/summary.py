@@ -42,6 +42,7 @@ STUDIES = {
     "pick-and-place-in-80000-steps": "q = 1, 80,000 steps in all",
     "claims-pick-and-place": MUSIC,
     "joint-slide": "joint entropy, MUSIC-r",
+    "equal-entropy-slide": "joint entropy, 1.5 nats by a fixed α, MUSIC-r",
     "claims-slide": MUSIC,
 }
 """Setting of each study."""

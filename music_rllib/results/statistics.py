@@ -305,12 +305,12 @@ def with_interval(value: float | None, ends: Sequence[float | None] | None) -> s
     low, high = ends or (None, None)
     if low is None or high is None or low != low or high != high:
         return number(value) if abs(value) >= 100 else f"{value:.3g}"
-    decimals = _decimals(value, low, high)
+    decimals = decimals_of(value, low, high)
     value, low, high = (round(one, decimals) + 0.0 for one in (value, low, high))
     return f"{value:,.{decimals}f} [{low:,.{decimals}f}, {high:,.{decimals}f}]"
 
 
-def _decimals(value: float, low: float, high: float) -> int:
+def decimals_of(value: float, low: float, high: float) -> int:
     """Two decimals, none from 100 on, and as many as a narrower interval needs."""
     decimals = 0 if max(abs(value), abs(low), abs(high)) >= 100 else 2
     if 0 < high - low < math.inf:
@@ -323,14 +323,14 @@ def interval_text(estimate: Estimate) -> str:
     if not estimate.has_interval:
         return "no interval"
     _, low, high = numbers = estimate.numbers
-    decimals = _decimals(*numbers)
+    decimals = decimals_of(*numbers)
     return f"{low:,.{decimals}f} to {high:,.{decimals}f}"
 
 
 def difference_text(estimate: Estimate) -> str:
     """`+0.12`, with as many decimals as its interval."""
     value, *_ = numbers = estimate.numbers
-    return f"{value:+,.{_decimals(*numbers)}f}"
+    return f"{value:+,.{decimals_of(*numbers)}f}"
 
 
 def p_text(p_value: float) -> str:

@@ -169,9 +169,13 @@ def _estimate(value: object) -> tuple[Cell, Cell]:
     """An estimate's value and its 95% CI."""
     if not isinstance(value, Estimate):
         return Cell(DASH, "number"), Cell(DASH)
-    low, high = float(value.lower), float(value.upper)
+    mean, low, high = value.numbers
+    if value.has_interval and math.isfinite(mean):
+        decimals = st.decimals_of(mean, low, high)
+        text = f"{round(mean, decimals) + 0.0:,.{decimals}f}"
+        return Cell(text, "number"), Cell(st.interval_text(value))
     interval = "no interval" if math.isnan(low) else f"{_number(low)} to {_number(high)}"
-    return Cell(_number(float(value.value)), "number"), Cell(interval)
+    return Cell(_number(mean), "number"), Cell(interval)
 
 
 UNFOLDED_ROWS = 30

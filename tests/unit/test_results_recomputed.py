@@ -35,6 +35,7 @@ STUDIES = {  # export and compared stage
     ("FetchPickAndPlace", "joint entropy, MUSIC-r"): ("joint-pick", "music-r"),
     ("FetchPickAndPlace", MUSIC): ("claims-pick-and-place", "music-r"),
     ("FetchSlide", "joint entropy, MUSIC-r"): ("joint-slide", "music-r"),
+    ("FetchSlide", f"{AT} a fixed α, MUSIC-r"): ("equal-entropy-slide", "music-r"),
     ("FetchSlide", MUSIC): ("claims-slide", "music-r"),
 }
 TOTALS = {"claims-pick-and-place": 200_000, "joint-music": 30_000}
@@ -42,7 +43,7 @@ TOTALS = {"claims-pick-and-place": 200_000, "joint-music": 30_000}
 COUNTED = {
     **dict.fromkeys(("joint-music", "equal-entropy-fixed", "equal-entropy"), 30_000),
     **dict.fromkeys(("joint-pick", "pick-and-place-in-80000-steps"), 80_000),
-    "joint-slide": 200_000,
+    **dict.fromkeys(("joint-slide", "equal-entropy-slide"), 200_000),
 }
 """Steps of the studies whose metric counts the pretraining."""
 IN_DETAIL = {
@@ -52,6 +53,7 @@ IN_DETAIL = {
     "claims-push": "## FetchPush\n",
     "claims-pick-and-place": "## FetchPickAndPlace\n",
     "claims-slide": "## FetchSlide\n",
+    "equal-entropy-slide": "## FetchSlide at equal entropy\n",
 }
 """Studies whose tables are on the page of details: the text before them."""
 WITH_HER = ("claims-pick-and-place", "joint-slide")
@@ -466,30 +468,46 @@ def test_music_r_on_30_seeds_of_three_studies() -> None:
     assert text in " ".join(PAGE.split())
 
 
+def last(study: str, metric: str, stage: str, q: str) -> pd.Series:
+    """The last value of each seed."""
+    own = runs(study, stage).query("q == @q")
+    return pd.Series([curve(study, run, metric)[1][-1] for run in own.run], own.seed)
+
+
+def interval(gap: pd.Series, decimals: str) -> str:
+    """Student's interval."""
+    ends = stats.t.interval(0.95, len(gap) - 1, gap.mean(), stats.sem(gap))
+    return " to ".join(f"{end:{decimals}}" for end in ends)
+
+
+def broader(study: str) -> str:
+    """How much broader policies of q = 1.5 and 2 end than those of q = 1."""
+    one, *others = (last(study, ENTROPIES[0], "music-r", q) for q in ("1", "1.5", "2"))
+    means = " and ".join(f"{(other - one).mean():.2f}" for other in others)
+    intervals = " and ".join(interval(other - one, ".2f") for other in others)
+    return f"{means} nats broader than those of q = 1 (95% CI {intervals})"
+
+
+def test_entropies_at_equal_entropy_on_fetchslide() -> None:
+    text = " ".join(PAGE.split())
+    assert f"policies of q = 1.5 and 2 end {broader('equal-entropy-slide')}" in text
+
+
 def test_the_observations_in_the_joint_form_on_fetchslide() -> None:
     study, text = "joint-slide", " ".join(PAGE.split())
-
-    def last(metric: str, stage: str, q: str) -> pd.Series:
-        own = runs(study, stage).query("q == @q")
-        return pd.Series([curve(study, run, metric)[1][-1] for run in own.run], own.seed)
-
-    def interval(gap: pd.Series, decimals: str) -> str:
-        ends = stats.t.interval(0.95, len(gap) - 1, gap.mean(), stats.sem(gap))
-        return " to ".join(f"{end:{decimals}}" for end in ends)
-
     gaps = [
         areas(study, "music-r", a, MEAN) - areas(study, "music-r", b, MEAN) for a, b in BETWEEN_Q
     ]
     spread = [gap.std() for gap in gaps]
     assert f"standard deviation of {min(spread):.2f} to {max(spread):.2f}" in text
-    ends = [last(MEAN, "music-r", q).mean() for q in ("1", "1.5", "2")]
+    ends = [last(study, MEAN, "music-r", q).mean() for q in ("1", "1.5", "2")]
     assert f"All q end at {100 * min(ends):.0f} to {max(ends):.0%}." in text
-    one, *others = (last(ENTROPIES[0], "music-r", q) for q in ("1", "1.5", "2"))
+    one, *others = (last(study, ENTROPIES[0], "music-r", q) for q in ("1", "1.5", "2"))
     means = " and ".join(f"{(one - other).mean():.2f}" for other in others)
     intervals = " and ".join(interval(one - other, ".2f") for other in others)
     found = f"{means} nats narrower than those of q = 1 (95% CI {intervals}; not planned)"
     assert found in text
-    behind = 100 * (last(MEAN, "her", "1") - last(MEAN, "music-r", "1"))
+    behind = 100 * (last(study, MEAN, "her", "1") - last(study, MEAN, "music-r", "1"))
     points = f"{behind.mean():.0f} percentage points below (95% CI {interval(behind, '.0f')}"
     assert points in text
     alone, own = (

@@ -121,7 +121,7 @@ def drawn_figure(subplots: Sequence[Subplot], legend: Legend, width: float) -> F
     for axes in grid.flat[len(subplots) :]:
         axes.set_axis_off()
     for axes, subplot in zip(grid.flat, chain(*rows), strict=False):
-        axes.set_title(_wrapped(subplot.title, 0.8 * width / columns))  # its letters are larger
+        axes.set_title(_wrapped(subplot.title, width / columns, 100 / mpl.rcParams["font.size"]))
         axes.patch.set_alpha(0.0)
         subplot.draw(axes)
         axes.set_xlabel(_wrapped(axes.get_xlabel(), width / columns))
@@ -133,6 +133,7 @@ def drawn_figure(subplots: Sequence[Subplot], legend: Legend, width: float) -> F
     return figure
 
 
-def _wrapped(label: str, inches: float) -> str:
-    lines = (textwrap.fill(line, int(_LETTERS_OF_AN_AXIS * inches)) for line in label.split("\n"))
+def _wrapped(label: str, inches: float, letters: float = _LETTERS_OF_AN_AXIS) -> str:
+    """The label in lines of at most `inches`, at this number of letters per inch."""
+    lines = (textwrap.fill(line, int(letters * inches)) for line in label.split("\n"))
     return "\n".join(lines)
