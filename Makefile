@@ -39,9 +39,9 @@ endif
 # try other builds of it, each of which is a download of gigabytes.
 $(STAMP): pyproject.toml constraints.txt
 	@command -v "$(PYTHON)" >/dev/null || \
-	  { echo "'$(PYTHON)' was not found. Install Python >= 3.11, or run 'make PYTHON=/path/to/python'." >&2; exit 1; }
+	  { echo "'$(PYTHON)' was not found. Install Python >= 3.11, or run 'make $(MAKECMDGOALS) PYTHON=/path/to/python'." >&2; exit 1; }
 	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
-	  { echo "music_rllib needs Python >= 3.11; '$(PYTHON)' is $$("$(PYTHON)" -V 2>&1). Run 'make PYTHON=/path/to/python'." >&2; exit 1; }
+	  { echo "music_rllib needs Python >= 3.11; '$(PYTHON)' is $$("$(PYTHON)" -V 2>&1). Run 'make $(MAKECMDGOALS) PYTHON=/path/to/python'." >&2; exit 1; }
 	@"$(PYTHON)" -c 'import venv, ensurepip' 2>/dev/null || \
 	  { echo "'$(PYTHON)' has no venv module (on Debian and Ubuntu: apt-get install python3-venv)." >&2; exit 1; }
 	@echo "[1/4] creating $(VENV) with $$("$(PYTHON)" -V 2>&1)"
@@ -58,7 +58,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@echo "$(VENV) is ready"
 
 sweep: venv  ## train the packaged sweep and write its report (minutes)
-	@$(BIN)/python -m music_rllib.sweep $(CONFIG)
+	@$(BIN)/python -m music_rllib.sweep $(if $(CONFIG),"$(CONFIG)")
 
 test: venv  ## run the whole suite (CI=true: a missing service is a failure, not a skip)
 	@$(PYTEST) $(PYTEST_ARGS)

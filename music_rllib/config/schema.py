@@ -51,7 +51,7 @@ class Resources(StrictModel):
     memory_per_run: float | None = Field(None, gt=0)
     """GiB of memory reserved for a run, which limits the number of concurrent runs; null: no
     memory is reserved."""
-    hang_minutes: float | None = Field(5.0, gt=0)
+    hang_minutes: float | None = Field(5.0, gt=0, le=1e6)
     """Minutes after which a call of an environment's `step()` or `reset()` counts as hanging: the
     run fails with the stack of the call, and other runs continue. null: no limit."""
     storage_minutes: float = Field(15.0, ge=0)

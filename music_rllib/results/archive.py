@@ -39,7 +39,7 @@ from music_rllib.results.data import (
     history_of,
     joined,
 )
-from music_rllib.results.exported_tables import read_table, write_table
+from music_rllib.store.tables import read_table, write_table
 
 Format = Literal["csv", "parquet"]
 _HEADER, _SEARCHES, _PLANS = "sweep.json", "search.json", "analysis_plan.json"

@@ -129,7 +129,10 @@ def _open_search(sweep: OpenSweep, stage: Stage, alone: bool) -> Search:
     settings = stage.search
     assert settings is not None
     sweep.folder.mkdir(parents=True, exist_ok=True)
-    storage, determined_by = open_studies(_place(sweep, settings)), _determined_by(sweep, stage)
+    place = _place(sweep, settings)
+    if settings.storage is None:
+        Path(place).parent.mkdir(parents=True, exist_ok=True)
+    storage, determined_by = open_studies(place), _determined_by(sweep, stage)
     studies = [
         OptunaStudy(
             storage,

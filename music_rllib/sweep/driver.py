@@ -227,13 +227,14 @@ def _open(
 def _with_environment(console: Console, config: SweepConfig) -> SweepConfig:
     """The sweep with MLFLOW_TRACKING_URI as its `mlflow.tracking_uri`, unless it has one."""
     uri, given = os.environ.get(VARIABLE), config.document.get("mlflow") or {}
-    if not uri or "tracking_uri" in given:
+    # A task of a Slurm array has a file of its own, which `resume` must not use later.
+    of_task = bool(uri and (own := os.environ.get(VARIABLE_STUDIES)) and own in uri)
+    if not uri or given.get("tracking_uri") or ("tracking_uri" in given and not of_task):
         return config
     how = "mlflow.tracking_uri=null keeps a sqlite file in the storage"
     _say(console, f"MLflow: {redact(uri)}, from {VARIABLE} ({how})")
-    config = replace(config, mlflow=MlflowSettings(**given, tracking_uri=uri))
-    # A task of a Slurm array has a file of its own, which `resume` must not use later.
-    if (own := os.environ.get(VARIABLE_STUDIES)) and own in uri:
+    config = replace(config, mlflow=MlflowSettings(**{**given, "tracking_uri": uri}))
+    if of_task:
         return config
     return replace(config, document={**config.document, "mlflow": vars(config.mlflow)})
 

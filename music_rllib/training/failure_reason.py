@@ -36,7 +36,7 @@ def cause_of(error: BaseException | None, text: str) -> str:
     else:
         first, *rest = _non_empty(message_of(error)) or ["(no message)"]
         lines = [f"{type(error).__name__}: {first}", *rest[:1]]
-    return "\n".join(map(shorten, lines))
+    return _encodable("\n".join(map(shorten, lines)))
 
 
 def trace_of(error: BaseException) -> str:
@@ -47,7 +47,12 @@ def trace_of(error: BaseException) -> str:
     """
     if hasattr(error, "ray_terminate_msg"):
         raise error
-    return "".join(traceback.format_exception(error))
+    return _encodable("".join(traceback.format_exception(error)))
+
+
+def _encodable(text: str) -> str:
+    """The text with escapes for what is not Unicode, such as file names of other encodings."""
+    return text.encode("utf-8", "backslashreplace").decode()
 
 
 @contextmanager

@@ -230,30 +230,30 @@ def compute(
         if capacity.remark is not None:
             remark(capacity.remark)
         for number in count():
-            if not _wait_for_a_run(searcher, stopping, listeners):
-                break
-            tuner = tune.Tuner(
-                RunTrainable,
-                tune_config=tune.TuneConfig(
-                    search_alg=searcher,
-                    num_samples=-1,  # as many as the searcher suggests
-                    scheduler=_Scheduler(),
-                    reuse_actors=_may_share_processes(sweep),
-                    trial_name_creator=_trial_name,
-                    trial_dirname_creator=_trial_name,
-                ),
-                run_config=tune.RunConfig(
-                    name=f"tune{number}",
-                    storage_path=folder,
-                    verbose=0,
-                    callbacks=[events, stopping],
-                    # For workers that die; errors of a run are in its result.
-                    failure_config=tune.FailureConfig(max_failures=RESTARTS),
-                    # The trainable writes its own checkpoints.
-                    checkpoint_config=tune.CheckpointConfig(checkpoint_at_end=False),
-                ),
-            )
             try:
+                if not _wait_for_a_run(searcher, stopping, listeners):
+                    break
+                tuner = tune.Tuner(
+                    RunTrainable,
+                    tune_config=tune.TuneConfig(
+                        search_alg=searcher,
+                        num_samples=-1,  # as many as the searcher suggests
+                        scheduler=_Scheduler(),
+                        reuse_actors=_may_share_processes(sweep),
+                        trial_name_creator=_trial_name,
+                        trial_dirname_creator=_trial_name,
+                    ),
+                    run_config=tune.RunConfig(
+                        name=f"tune{number}",
+                        storage_path=folder,
+                        verbose=0,
+                        callbacks=[events, stopping],
+                        # For workers that die; errors of a run are in its result.
+                        failure_config=tune.FailureConfig(max_failures=RESTARTS),
+                        # The trainable writes its own checkpoints.
+                        checkpoint_config=tune.CheckpointConfig(checkpoint_at_end=False),
+                    ),
+                )
                 tuner.fit()
             except Exception as error:
                 if stopping.received is not None and not _has_working_folder():

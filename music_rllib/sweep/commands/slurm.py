@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import subprocess
@@ -70,10 +71,14 @@ def slurm(
     report.
     """
     from music_rllib.sweep import driver
+    from music_rllib.tracking.store import resolve_store
 
     if any(one.startswith("resources.num_cpus=") for one in overrides or ()):
         raise BadInputError("resources.num_cpus must not be given: --cpus sets it for each task")
-    config = driver.load(file, overrides, storage=storage, name=name, seeds=seeds)
+    of_a_task = [*(overrides or ()), f"resources.num_cpus={cpus}"]
+    config = driver.load(file, of_a_task, storage=storage, name=name, seeds=seeds)
+    # The tasks log to files of their own, the job after them to this store.
+    resolve_store(config.mlflow.tracking_uri or os.environ.get(driver.VARIABLE), config.storage)
     if not _TIME.fullmatch(time):
         raise BadInputError(f"--time must be a time of Slurm such as 12:00:00 or 1-00, got {time}")
     options = {"job-name": config.name, "time": time, "cpus-per-task": cpus, "partition": partition}

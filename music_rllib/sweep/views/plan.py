@@ -215,6 +215,8 @@ def cluster_text(address: str, answer: Mapping[str, Any]) -> str:
     """The answer as a sentence: `Cluster head:6379: 3 nodes hold 8 runs at a time. ...`."""
     nodes = "1 node holds" if answer["nodes"] == 1 else f"{answer['nodes']} nodes hold"
     text = f"Cluster {address}: {nodes} {in_runs(answer['runs_at_once'])} at a time"
+    if not answer["runs_left"]:  # the runs of a search are not planned yet
+        return f"{text}."
     left, seconds = in_runs(answer["runs_left"]), answer["expected_seconds"]
     if seconds is None:
         return f"{text}. 'plan --measure' estimates the duration of the {left} left."

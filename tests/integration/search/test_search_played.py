@@ -675,7 +675,6 @@ def test_two_drivers_of_one_sweep_share_its_runs(
     drivers = []
     for seed in (0, 1):
         if study == "of each driver":
-            (tmp_path / f"{seed}").mkdir()
             monkeypatch.setenv(names.VARIABLE_STUDIES, str(tmp_path / f"{seed}"))
         content = document(search, seeds=[0, 1])
         drivers.append(Driver(tmp_path / "shared", content, seed=seed, leases=True))

@@ -120,6 +120,10 @@ def test_the_mlflow_file_of_a_slurm_task_is_not_recorded(
     monkeypatch.setenv("MUSIC_RLLIB_STUDIES", f"{tmp_path}/own")
     seen = driver._with_environment(console_for(), config)
     assert (seen.mlflow.tracking_uri, seen.document.get("mlflow")) == (uri, None)
+    null = loaded(tmp_path, document(mlflow={"tracking_uri": None}))
+    seen = driver._with_environment(console_for(), null)
+    assert seen.mlflow.tracking_uri == uri, "tasks must not write one file on a shared disk"
+    assert seen.document["mlflow"] == {"tracking_uri": None}
 
 
 BAD: list[tuple[Document, str]] = [

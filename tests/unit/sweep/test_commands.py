@@ -1068,6 +1068,8 @@ def test_slurm_writes_a_job_array_and_submits_it(
         ("--partition=a\n#b", "on one line"),
         ("--sbatch=account=me", "--sbatch and --partition must"),
         ("tac.gamma=7", "< 1"),
+        ("resources.cpus_per_run=16", "must be <= num_cpus (8), got 16"),
+        ("--storage=s3://bucket/x", "mlflow.tracking_uri must be set if storage is not a local"),
     ):
         refused = program(*command, wrong)
         assert (refused.code, said in refused.errors) == (2, True)

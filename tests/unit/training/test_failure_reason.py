@@ -1,12 +1,13 @@
 """The cause of a run's failure in one or two lines."""
 
+import os
 import re
 
 import pytest
 from ray.exceptions import ActorDiedError, OutOfMemoryError, RayActorError, RayTaskError
 
 from music_rllib.errors import BadInputError
-from music_rllib.training.failure_reason import cause_of, in_words_only
+from music_rllib.training.failure_reason import cause_of, in_words_only, trace_of
 
 DEATH = """The actor died unexpectedly before finishing this task.
 \tclass_name: RunTrainable
@@ -54,6 +55,9 @@ def test_an_exception_without_a_readable_message_keeps_its_name() -> None:
         == "WordlessError: (its message can't be read: LookupError)"
     )
     assert cause_of(SystemExit(3), "") == "SystemExit: 3"
+    latin_1 = ValueError(os.fsdecode(b"caf\xe9.xml"))
+    assert cause_of(latin_1, "") == "ValueError: caf\\udce9.xml"
+    trace_of(latin_1).encode()
     assert cause_of(ValueError("\x1b[1m\x1b[31mred\x1b[0m"), "") == "ValueError: red"
     with pytest.raises(BadInputError, match=r"^WordlessError: "), in_words_only():
         raise WordlessError(1, 2)
