@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from music_rllib import names
-from music_rllib.report.figures.choice import PRIMARY, Drawing, Facets
+from music_rllib.report.figures.choice import PRIMARY, Drawing, Facets, without
 from music_rllib.results.analysis import Curve
 from music_rllib.results.conditions import SIDE_BY_SIDE
 from music_rllib.results.data import Sweep
@@ -37,7 +37,9 @@ def chart_data(sweep: Sweep, drawings: Sequence[Drawing]) -> dict[str, Any]:
         if drawing.metric is not None:
             metrics[drawing.metric.name] = drawing.metric
             by_stage.setdefault(drawing.stage, []).append(drawing)
-    stages = [_stage(name, drawn) for name, drawn in by_stage.items()]
+    together = by_stage.get(SIDE_BY_SIDE)
+    setting = _facets(together[0]).setting if together else ""
+    stages = [_stage(name, drawn, setting) for name, drawn in by_stage.items()]
     # A condition has the same style in all figures, because the page has one legend.
     styles = {
         one["key"]: {"color": one["color"], "dashes": one["dashes"]}
@@ -99,9 +101,16 @@ def _subplots(drawings: Sequence[Drawing]) -> list[str]:
     return list(dict.fromkeys(title for drawing in drawings for title in drawing.curves))
 
 
-def _stage(name: str, drawings: Sequence[Drawing]) -> dict[str, Any]:
+def _stage(name: str, drawings: Sequence[Drawing], setting: str) -> dict[str, Any]:
+    """A stage; `setting` has subplots of its own where all stages are together."""
     titles, facets = _subplots(drawings), _facets(drawings[0])
     together = name == SIDE_BY_SIDE
+    # Labels of all stages together begin with the stage: a condition has one key.
+    keys = [facets.label(one) for one in facets.styles]
+    if not together:
+        alike = [f"{name}, {facets.label(without(one, setting))}" for one in facets.styles]
+        unique = len(set(alike)) == len(alike)
+        keys = alike if unique else [f"{name}, {key}" for key in keys]
     return {
         "name": name,
         "together": together,
@@ -110,13 +119,12 @@ def _stage(name: str, drawings: Sequence[Drawing]) -> dict[str, Any]:
         "primary": [_primary(title, drawings) for title in titles],
         "conditions": [
             {
-                "label": (label := facets.label(condition)),
-                # Labels of all stages together begin with the stage: a condition has one key.
-                "key": label if together else f"{name}, {label}",
+                "label": facets.label(condition),
+                "key": key,
                 "color": style.color,
                 "dashes": " ".join(map(str, style.dashes)),
             }
-            for condition, style in facets.styles.items()
+            for key, (condition, style) in zip(keys, facets.styles.items(), strict=True)
         ],
     }
 

@@ -67,10 +67,15 @@ def difference_tables(
 
 def _settings_table(first: Sweep, second: Sweep, titles: tuple[str, str]) -> Table:
     one, other = _setting_values(first), _setting_values(second)
-    rows = [
+    stages = [{stage for stage, _ in values} for values in (one, other)]
+    rows: list[tuple[str | None, ...]] = [
         (*key, _values_text(one.get(key)), _values_text(other.get(key)))
         for key in sorted({*one, *other})
-        if one.get(key) != other.get(key)
+        if one.get(key) != other.get(key) and key[0] in stages[0] & stages[1]
+    ]
+    rows += [
+        (stage, "the stage itself", *("yes" if stage in own else "no" for own in stages))
+        for stage in sorted(stages[0] ^ stages[1])
     ]
     return Table(
         title="Settings that differ",

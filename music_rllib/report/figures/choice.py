@@ -150,7 +150,7 @@ class Facets:
     def of(cls, stage: StageRuns) -> Facets:
         """One subplot for a task, unless it would have too many conditions."""
         setting = facet_of(stage.conditions)
-        rest = {condition: _without(condition, setting) for condition in stage.conditions}
+        rest = {condition: without(condition, setting) for condition in stage.conditions}
         styles = styles_of(tuple(dict.fromkeys(rest.values())))
         return cls(setting, {condition: styles[rest[condition]] for condition in rest})
 
@@ -161,11 +161,12 @@ class Facets:
 
     def label(self, condition: Condition) -> str:
         """The condition's label in its subplot, `music-r, q = 1.5` in one of several stages."""
-        rest = _without(_without(condition, self.setting), "stage")
+        rest = without(without(condition, self.setting), "stage")
         return ", ".join(filter(None, (dict(condition.others).get("stage"), rest.label)))
 
 
-def _without(condition: Condition, setting: str) -> Condition:
+def without(condition: Condition, setting: str) -> Condition:
+    """The condition without one of its settings, and without runs."""
     others = tuple(pair for pair in condition.others if pair[0] != setting)
     return replace(condition, others=others, runs=())
 
@@ -318,7 +319,7 @@ def study_drawings(study: Study, title: str = "") -> Iterator[Drawing]:
             legend=[(condition.short_label, style) for condition, style in shown.items()],
         )
     if lines := alpha_lines(study.means):
-        alike = [_without(line[0][1].condition, ALPHA) for line in lines]
+        alike = [without(line[0][1].condition, ALPHA) for line in lines]
         of_lines = styles_of(tuple(dict.fromkeys(alike)))
         drawn = [(line, of_lines[one]) for line, one in zip(lines, alike, strict=True)]
         yield Drawing(

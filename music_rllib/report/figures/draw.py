@@ -121,7 +121,8 @@ def drawn_figure(subplots: Sequence[Subplot], legend: Legend, width: float) -> F
     for axes in grid.flat[len(subplots) :]:
         axes.set_axis_off()
     for axes, subplot in zip(grid.flat, chain(*rows), strict=False):
-        axes.set_title(_wrapped(subplot.title, width / columns, 100 / mpl.rcParams["font.size"]))
+        inches = subplot.plot_width * width / columns
+        axes.set_title(_wrapped(subplot.title, inches, 100 / mpl.rcParams["font.size"]))
         axes.patch.set_alpha(0.0)
         subplot.draw(axes)
         axes.set_xlabel(_wrapped(axes.get_xlabel(), width / columns))

@@ -171,6 +171,8 @@ class Subplot:
     draw: Callable[[Axes], None]
     height: float = HEIGHT
     """Height in inches."""
+    plot_width: float = 1.0
+    """Share of its width that labels of rows leave."""
 
 
 def curve_subplot(
@@ -295,7 +297,8 @@ def _with_rows(title: str, labels: Sequence[str], draw: Callable[[Axes], None]) 
         axes.grid(visible=False, axis="y")
         draw(axes)
 
-    return Subplot(title=title, draw=whole, height=max(HEIGHT, 1.0 + 0.2 * lines))
+    height = max(HEIGHT, 1.0 + 0.2 * lines)
+    return Subplot(title=title, draw=whole, height=height, plot_width=0.5)
 
 
 def profile_subplot(task: str, means: Sequence[Mean], styles: Styles) -> Subplot:

@@ -689,6 +689,22 @@ def test_a_condition_of_the_page_has_one_style() -> None:
     assert len({*map(tuple, found.values())}) == 4
 
 
+def test_a_condition_has_one_style_if_a_setting_has_subplots_of_its_own() -> None:
+    runs = [
+        (one_run(q, 0, stage=stage, params={"tac.alpha": alpha}, alpha=alpha), climbing(0.5))
+        for stage in ("a", "b")
+        for q, alpha in (("1", "0.1"), ("1.5", "0.2"), ("2", "0.3"), ("3", "0.4"))
+    ]
+    report = build_report(sweep_of(runs))
+    both, *stages = sorted(
+        chart_data(report.sweep, report.drawings)["stages"], key=lambda one: not one["together"]
+    )
+    assert both["faceted"]
+    styles = {one["key"]: (one["color"], one["dashes"]) for one in both["conditions"]}
+    for one in (one for stage in stages for one in stage["conditions"]):
+        assert styles[one["key"]] == (one["color"], one["dashes"])
+
+
 def test_small_values_keep_their_digits() -> None:
     page = render(build_report(returning({"1": [0.005] * 5, "2": [0.003, 0.0032] * 2})))
     assert row_of(page, "Reacher", "q = 2", "return")[:1] == ["0.0031"]

@@ -9,7 +9,7 @@ from pathlib import Path
 from music_rllib import names
 from music_rllib.report.build import build_report, write_report
 from music_rllib.report.page import render
-from music_rllib.report.two_sweeps import joined_sweeps
+from music_rllib.report.two_sweeps import difference_tables, joined_sweeps
 from music_rllib.results.archive import read_archive
 from music_rllib.results.statistics import Estimate
 from tests.unit.report.test_page import compared
@@ -35,6 +35,13 @@ def test_settings_and_results_that_differ_are_in_tables() -> None:
     assert float(gap.value) == 0
     page = render(made)
     assert page.count("<h2>Differences</h2>") == 1
+    moved = [replace(run, tags={**run.tags, names.TAG_STAGE: "new"}) for run in changed]
+    tables = difference_tables(first, replace(second, runs=moved), ())
+    stage = first.runs[0].stage
+    assert [row[:2] for row in tables[0].rows] == [
+        ("new", "the stage itself"),
+        (stage, "the stage itself"),
+    ]
     same = joined_sweeps(first, first)
     assert {run.stage.partition(":")[0] for run in same.runs} == {
         "proof-fetch-reach (first)",
