@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
 import pytest
 
+from docs.generate_configuration import TARGET, document, json_schema
 from music_rllib import names
+from music_rllib.config.document import SCHEMA
 from music_rllib.config.load import load_config
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.results.analysis_plan import analysis_plan
@@ -34,6 +37,11 @@ def test_links_between_pages_lead_somewhere(page: Path) -> None:
         assert path.exists(), f"{page.name}: {target}"
         if anchor:
             assert anchor in anchors(path.read_text(encoding="utf-8")), f"{page.name}: {target}"
+
+
+def test_the_reference_and_the_schema_are_those_of_the_settings() -> None:
+    found = TARGET.read_text("utf-8"), json.loads(SCHEMA.read_text("utf-8"))
+    assert found == (document(), json_schema()), "run python docs/generate_configuration.py"
 
 
 def test_every_built_in_task_matches_its_description() -> None:
