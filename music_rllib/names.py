@@ -151,7 +151,7 @@ TAG_NODE_KEY = "node_key"
 TAG_ENVIRONMENT = "environment"
 """Hash of the run's environment apart from its settings: source code, models, versions."""
 TAG_RESULT = "result"
-"""Hash of a finished run's history, without which it may be of an earlier training."""
+"""Hash of a finished run's history; with another hash, the run is of an earlier training."""
 TAG_PLAN = "plan"
 """Hash of the sweep's plan, on the parent run. A changed plan has its own parent run, because
 MLflow's params never change."""

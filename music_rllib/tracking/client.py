@@ -54,7 +54,7 @@ _LASTING_ERRORS = frozenset(
     }
 )
 _UNCLEAR_ERRORS = frozenset({"BAD_REQUEST", "ENDPOINT_NOT_FOUND"})
-"""Of a refused value, and also of a proxy without a server and of a database that is away."""
+"""Codes of refused values, but also of a proxy without its server or a database that fails over."""
 Status = Literal["FINISHED", "FAILED", "KILLED"]
 
 _HINTS = {
