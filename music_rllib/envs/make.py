@@ -96,13 +96,17 @@ def is_gymnasium_id(env: object) -> bool:
 
 def episode_limit(env: Env, setting: int | None) -> int:
     """Length of the longest episode: the smaller of `setting` and the environment's own limit."""
-    own = env.spec.max_episode_steps if env.spec is not None else None
-    limits = [limit for limit in (setting, own) if limit is not None]
-    if not limits:
+    limits = [setting, env.spec.max_episode_steps if env.spec is not None else None]
+    while isinstance(env, gym.Wrapper):
+        if isinstance(env, gym.wrappers.TimeLimit):
+            limits.append(env._max_episode_steps)
+        env = env.env
+    found = [limit for limit in limits if limit is not None]
+    if not found:
         raise ValueError(
             "tac.max_episode_steps must be set: the environment has no time limit of its own"
         )
-    return min(limits)
+    return min(found)
 
 
 def reset_seed(

@@ -350,6 +350,10 @@ class TrajectoryReplay(TrajectoryRing):
             self._moved = np.array(moved, np.bool_)
         self._refresh()
         if self._td is not None:
+            if index["td"] is None:
+                raise ValueError(
+                    "replay.priority must be that of the checkpoint, which has no TD errors"
+                )
             self._td.load_packed(self._starts, self._lengths, index["td"])
         self._write = int(index["write"])
         self.rng.bit_generator.state = index["rng"]

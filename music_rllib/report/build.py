@@ -39,7 +39,7 @@ from music_rllib.report.figures.choice import (
 from music_rllib.report.figures.draw import files
 from music_rllib.report.figures.plots import Legend, Subplot
 from music_rllib.report.page import SweepReport, render, runs_table
-from music_rllib.report.two_sweeps import difference_tables, titled
+from music_rllib.report.two_sweeps import difference_tables, titles_of
 from music_rllib.report.videos import Videos, make_videos
 from music_rllib.results.analysis import METRICS, StageAnalysis, analyse, mixed
 from music_rllib.results.answer import claim_rows, mean_rows
@@ -100,9 +100,10 @@ def build_report(
     """
     analyses = analyse(sweep)
     stages = [analysis.stage for analysis in analyses]
-    # Each of two sweeps has a plan of its own.
-    studies = {f"{title}: ": study_of(one) for title, one in titled(both)}
-    studies = studies or {"": study_of(sweep)}
+    studies = {"": study_of(sweep)}
+    if both is not None:  # each has a plan of its own
+        titles = titles_of(*both)
+        studies = {f"{t}: ": study_of(one) for t, one in zip(titles, both, strict=True)}
     drawings = chain(
         *(stage_drawings(sweep, analysis) for analysis in analyses),
         drawings_of_stages(sweep, stages),

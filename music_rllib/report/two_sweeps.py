@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from music_rllib import names
@@ -31,12 +31,6 @@ def titles_of(first: Sweep, second: Sweep) -> tuple[str, str]:
     if first.name != second.name:
         return first.name, second.name
     return f"{first.name} (first)", f"{second.name} (second)"
-
-
-def titled(both: tuple[Sweep, Sweep] | None) -> Iterator[tuple[str, Sweep]]:
-    """The sweeps with their titles, in a report on two sweeps."""
-    if both is not None:
-        yield from zip(titles_of(*both), both, strict=True)
 
 
 def _renamed(sweep: Sweep, title: str) -> Sweep:

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from ray.rllib.algorithms.algorithm import Algorithm
-from ray.rllib.core import COMPONENT_EVAL_ENV_RUNNER, COMPONENT_RL_MODULE
+from ray.rllib.core import ALL_MODULES, COMPONENT_EVAL_ENV_RUNNER, COMPONENT_RL_MODULE
 from ray.rllib.env.env_runner_group import EnvRunnerGroup
 from ray.rllib.utils.metrics import (
     ENV_RUNNER_RESULTS,
@@ -41,7 +39,9 @@ from music_rllib.runtime.machine import own_folder
 from music_rllib.schedules import value_at
 from music_rllib.tac.config import AlgorithmSettings, TACConfigBase
 from music_rllib.tac.env_runner import SUCCESS_LAST, TrajectoryEnvRunner, seed_or_entropy
+from music_rllib.tac.learner import GRAD_UPDATES
 from music_rllib.tac.minibatches import INTRINSIC, batch_of
+from music_rllib.tac.random_state import determinism_without_compiler
 from music_rllib.tac.rl_module import (
     ESTIMATOR_MODULE,
     NetworkWeights,
@@ -66,7 +66,7 @@ class TAC(Algorithm):
         return TACConfig()
 
     def setup(self, config: TACConfig) -> None:
-        with _determinism_without_compiler():
+        with determinism_without_compiler():
             super().setup(config)
         self._settings: AlgorithmSettings = self.config.settings
         name = self._settings.intrinsic.reward
@@ -163,6 +163,8 @@ class TAC(Algorithm):
             if drawn.weights is not None:
                 errors = self._call_learner(lambda learner: learner.take_td_errors())
                 self.replay.update_priorities(drawn.rows, errors)
+        key = (LEARNER_RESULTS, ALL_MODULES, GRAD_UPDATES)
+        self.metrics.log_value(key, self.grad_updates, window=1)
         with self.metrics.log_time((TIMERS, SYNCH_WORKER_WEIGHTS_TIMER)):
             self._sync_weights(self.env_runner_group)
 
@@ -239,8 +241,15 @@ class TAC(Algorithm):
                         f"environment runners {sorted(missing)} died and did not come back within "
                         f"{REVIVE_SECONDS:.0f} s"
                     )
-                if not self.restore_env_runners(self.env_runner_group):
+                restored = self.restore_env_runners(self.env_runner_group)
+                if not restored:
                     time.sleep(0.5)
+                    continue
+                self._make_on_env_runners_recreated_callbacks(
+                    config=self.config,
+                    env_runner_group=self.env_runner_group,
+                    restored_env_runner_indices=restored,
+                )
         return [samples[index] for index in sorted(samples)]
 
     def restore_env_runners(self, env_runner_group: EnvRunnerGroup) -> list[int]:
@@ -389,26 +398,3 @@ _REPLAY_STREAM = 101
 def _random_state(runner: TrajectoryEnvRunner) -> tuple[int, StateDict]:
     """The worker index, and the state of the runner without its weights."""
     return runner.worker_index, runner.get_state(not_components=COMPONENT_RL_MODULE)
-
-
-@contextlib.contextmanager
-def _determinism_without_compiler() -> Iterator[None]:
-    """Save a second per process: RLlib seeds torch by a call that loads torch's compiler.
-
-    The call also sets the compiler's own flag, which matters only if the compiler is loaded.
-    """
-    if "torch._inductor" in sys.modules:
-        yield
-        return
-
-    def use(mode: bool, *, warn_only: bool = False) -> None:
-        torch.set_deterministic_debug_mode(
-            ("warn" if warn_only else "error") if mode else "default"
-        )
-
-    original = torch.use_deterministic_algorithms
-    torch.use_deterministic_algorithms = use
-    try:
-        yield
-    finally:
-        torch.use_deterministic_algorithms = original

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Self, TypeVar
 
@@ -10,6 +11,7 @@ from ray.rllib.algorithms.algorithm_config import AlgorithmConfig, NotProvided
 from ray.rllib.core import DEFAULT_MODULE_ID
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
+from ray.tune.search.sample import Domain
 
 from music_rllib.config.problems import problems_of
 from music_rllib.config.run_settings import ReplaySettings
@@ -136,15 +138,12 @@ class TACConfigBase(AlgorithmConfig):
         Raises:
             TypeError: unknown setting.
         """
-        if agent_indices is not NotProvided:
-            agent_indices = tuple(agent_indices)
-        if surrounding_indices is not NotProvided:
-            surrounding_indices = tuple(surrounding_indices)
-        return self._set(
-            _prefixed("music", settings, MusicSettings),
-            agent_indices=agent_indices,
-            surrounding_indices=surrounding_indices,
+        agent, surrounding = (
+            one if one is NotProvided or _is_searched(one) else tuple(one)
+            for one in (agent_indices, surrounding_indices)
         )
+        fields = _prefixed("music", settings, MusicSettings)
+        return self._set(fields, agent_indices=agent, surrounding_indices=surrounding)
 
     def intrinsic(self, **settings: Any) -> Self:
         """Add an intrinsic reward to the task's and MUSIC's.
@@ -174,7 +173,7 @@ class TACConfigBase(AlgorithmConfig):
         Raises:
             TypeError: unknown setting.
         """
-        if task_symmetries is not NotProvided:
+        if task_symmetries is not NotProvided and not _is_searched(task_symmetries):
             task_symmetries = Symmetries.model_validate(task_symmetries)
         fields = _prefixed("replay", settings, ReplaySettings)
         return self._set(fields, moved_distance=moved_distance, task_symmetries=task_symmetries)
@@ -202,11 +201,21 @@ class TACConfigBase(AlgorithmConfig):
         unknown = [
             key
             for key in config_dict
-            if not hasattr(self, key) and key not in known and not key.startswith("__")
+            if not self._has(key) and key not in known and not key.startswith("__")
         ]
         if unknown:
-            raise ValueError(f"unknown settings in the config: {', '.join(sorted(unknown))}")
+            raise ValueError(
+                f"unknown settings in the config: {', '.join(sorted(unknown))} (settings of groups "
+                "have a prefix, such as replay_capacity)"
+            )
         return super().update_from_dict(config_dict)  # type: ignore[no-any-return]
+
+    def _has(self, key: str) -> bool:
+        """Whether a setting has this name; methods and computed values are none."""
+        of_class = inspect.getattr_static(type(self), self._translate_special_keys(key), None)
+        if callable(of_class) or (isinstance(of_class, property) and of_class.fset is None):
+            return False
+        return hasattr(self, key)
 
     def to_dict(self) -> dict[str, Any]:
         found: dict[str, Any] = super().to_dict()
@@ -216,7 +225,7 @@ class TACConfigBase(AlgorithmConfig):
     def get_state(self) -> dict[str, Any]:
         # RLlib drops values of -1, which would then pass validation as the default.
         state: dict[str, Any] = super().get_state()
-        return state | {name: getattr(self, name) for name in _FIELDS}
+        return state | {name: getattr(self, name) for name in (*_FIELDS, "seed")}
 
     # -- reading --------------------------------------------------------------------------
 
@@ -251,6 +260,13 @@ class TACConfigBase(AlgorithmConfig):
         tac, music, replay, split, intrinsic = self.settings
         if self.in_evaluation:
             return
+        for name, value, least in (
+            ("debugging(seed=...)", self.seed, 0),
+            ("training(total_env_steps=...)", self.total_env_steps, 1),
+            ("training(torch_threads=...)", self.torch_threads, 1),
+        ):
+            if value is not None and value < least:
+                self._value_error(f"{name} must be >= {least}, got {value}")
         if self.num_learners > 1:
             self._value_error(
                 f"num_learners must be 0 or 1, got {self.num_learners}: one update of TAC is too "
@@ -347,6 +363,11 @@ _MODELS: tuple[tuple[type[BaseModel], str], ...] = (
 )
 """Types of `AlgorithmSettings`, and the prefix of their fields as attributes of the config."""
 _FIELDS = frozenset(prefix + name for model, prefix in _MODELS for name in model.model_fields)
+
+
+def _is_searched(value: Any) -> bool:
+    """Whether a value is one of Tune's search spaces, which Tune replaces."""
+    return isinstance(value, Domain) or (isinstance(value, dict) and "grid_search" in value)
 
 
 def _prefixed(method: str, settings: Mapping[str, Any], model: type[BaseModel]) -> dict[str, Any]:

@@ -30,6 +30,7 @@ from ray.rllib.utils.metrics import (
     WEIGHTS_SEQ_NO,
 )
 from ray.rllib.utils.typing import StateDict
+from ray.tune.registry import ENV_CREATOR, _global_registry
 
 from music_rllib.config.tac_settings import ColoredNoise, TACSettings
 from music_rllib.envs.episodes import Episode, Recording
@@ -122,7 +123,9 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
             vector_index=vector_index,
             num_workers=self.num_workers,
         )
-        if is_gymnasium_id(self.config.env):
+        # A name that is registered with Ray is the user's own environment, as in RLlib.
+        own = _global_registry.contains(ENV_CREATOR, self.config.env)
+        if is_gymnasium_id(self.config.env) and not own:
             env = make_env(self.config.env, **context)
         else:
             assert self._env_creator is not None

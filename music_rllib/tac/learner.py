@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from ray.rllib.core import ALL_MODULES, DEFAULT_MODULE_ID
+from ray.rllib.core import DEFAULT_MODULE_ID
 from ray.rllib.core.columns import Columns
 from ray.rllib.core.learner.torch.torch_learner import TorchLearner
 from ray.rllib.core.learner.training_data import TrainingData
@@ -48,6 +48,7 @@ from music_rllib.tac.minibatches import INTRINSIC, STORED, Minibatch, Minibatche
 from music_rllib.tac.networks import RunningNormaliser
 from music_rllib.tac.random_state import generator_states, set_generators
 from music_rllib.tac.rl_module import ESTIMATOR_MODULE, TACForward, TACModule, mean_values
+from music_rllib.tac.schedulers import add_schedulers, load_scheduler_states, scheduler_states
 
 GRAD_UPDATES = "grad_updates"
 
@@ -68,6 +69,7 @@ class TACLearner(TorchLearner):
         if self.config.num_gpus_per_learner:
             use_reproducible_gpu_kernels()
         super().build()
+        add_schedulers(self)
         seed = self.config.seed if self.config.seed is not None else torch.seed()
         self._generator = torch.Generator(device=self._device).manual_seed(seed + 7919)
         self._grad_updates = 0
@@ -202,9 +204,10 @@ class TACLearner(TorchLearner):
 
     def postprocess_gradients(self, gradients_dict: ParamDict) -> ParamDict:
         """Skip RLlib's sorting of gradients if nothing is clipped or logged."""
+        given = {key: one for key, one in gradients_dict.items() if one is not None}  # policy_delay
         if self.config.grad_clip is None and not self.config.log_gradients:
-            return gradients_dict
-        return super().postprocess_gradients(gradients_dict)
+            return given
+        return super().postprocess_gradients(given)
 
     def _step(self, minibatch: Minibatches) -> dict[str, Tensor]:
         """Update every network except the targets by autograd, on one minibatch.
@@ -330,7 +333,6 @@ class TACLearner(TorchLearner):
         keys, table = list(metrics), torch.stack([m.float() for m in metrics.values()], dim=1)
         # A NaN never leaves the networks again, so one check per call is enough.
         diagnostics.check_finite(keys, table, self._grad_updates, q, alpha)
-        log = self.metrics.log_value
         means = dict(zip(keys, table.mean(0).tolist(), strict=True))
         if self._settings.policy_delay > 1:
             improving = [self._improves(done + k) for k in range(len(table))]
@@ -341,8 +343,7 @@ class TACLearner(TorchLearner):
         if self.bonus is not None:
             measured |= self.bonus.metrics()
         for key, value in measured.items():
-            log((DEFAULT_MODULE_ID, key), value, window=1)
-        log((ALL_MODULES, GRAD_UPDATES), self._grad_updates, window=1)
+            self.metrics.log_value((DEFAULT_MODULE_ID, key), value, window=1)
         if names.SHANNON_ENTROPY in means:
             self._now.observe("shannon_entropy", means[names.SHANNON_ENTROPY])
 
@@ -396,10 +397,14 @@ class TACLearner(TorchLearner):
             GRAD_UPDATES: self._grad_updates,
             "held_out": self._music.state(),
             "scheduled": self._now.state(),
+            "schedulers": scheduler_states(self),
+            **({} if self.bonus is None else {"intrinsic": self.bonus.state()}),
         }
-        if self.bonus is not None:
-            state["tac"]["intrinsic"] = self.bonus.state()
         return state
+
+    def _set_optimizer_state(self, state: StateDict) -> None:
+        known = self._named_optimizers  # for another one, RLlib would register all of them again
+        super()._set_optimizer_state({name: state[name] for name in state if name in known})
 
     def set_state(self, state: StateDict) -> None:
         # RLlib ignores weights with an older sequence number; a restored state replaces newer ones.
@@ -410,5 +415,6 @@ class TACLearner(TorchLearner):
             set_generators(self._generator, state["tac"], self._grad_updates)
             self._music.load_state(state["tac"]["held_out"])
             self._now.load_state(state["tac"]["scheduled"])
+            load_scheduler_states(self, state["tac"].get("schedulers", {}))
             if self.bonus is not None and "intrinsic" in state["tac"]:
                 self.bonus.load_state(state["tac"]["intrinsic"])

@@ -100,7 +100,8 @@ class ScheduledSettings:
         """Continue from a result of `state`."""
         self._set(state["env_steps"], dict(state["followed"]))
         for name, follower in self._followers.items():
-            follower.load_state(state["followers"][name])
+            if name in state["followers"]:  # else the setting did not follow anything
+                follower.load_state(state["followers"][name])
 
 
 class Losses(NamedTuple):

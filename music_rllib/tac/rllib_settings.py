@@ -51,6 +51,10 @@ _REMEDIES: dict[str, tuple[str, ...]] = {
     "set the environment's render_mode in env_config": ("render_env",),
     "handle failures within the environment, or set env_runners(num_env_runners=...), whose "
     "processes are restarted": ("restart_failed_sub_environments",),
+    "a run without one of its environment runners would be another run: leave it False": (
+        "ignore_env_runner_failures",
+    ),
+    "environment runners compute on the CPU": ("num_gpus_per_env_runner",),
     "updates on a CPU are compiled already": ("torch_compile_learner", "torch_compile_worker"),
     "set learners(num_gpus_per_learner=...)": ("num_gpus",),
     "TAC trains one policy in a single-agent environment": ("policies_to_train", "observation_fn"),

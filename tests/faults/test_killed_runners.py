@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import signal
 from pathlib import Path
+from typing import Any, ClassVar
 
 import pytest
+from ray.rllib.callbacks.callbacks import RLlibCallback
 
 from music_rllib.tac.algorithm import TAC
 from tests.integration.algorithm.test_tac_algorithm import build, fingerprint
@@ -16,6 +18,13 @@ pytestmark = pytest.mark.usefixtures("local_ray")
 
 def remote_runner() -> TAC:
     return build(where={"num_env_runners": 1})
+
+
+class Restarts(RLlibCallback):  # type: ignore[misc]
+    runners: ClassVar[list[int]] = []
+
+    def on_env_runners_recreated(self, *, env_runner_indices: list[int], **_: Any) -> None:
+        self.runners.extend(env_runner_indices)
 
 
 def kill_runner(algo: TAC) -> None:
@@ -31,8 +40,10 @@ def test_a_killed_runner_changes_no_number(tmp_path: Path) -> None:
     expected = [fingerprint(unbroken, 1) for _ in range(4)]
     unbroken.stop()
     algo = remote_runner()
+    algo.callbacks.append(Restarts())
     kill_runner(algo)
     assert fingerprint(algo, 1) == expected[0]
+    assert Restarts.runners == [1]
     assert fingerprint(algo, 1) == expected[1]
     kill_runner(algo)
     assert fingerprint(algo, 1) == expected[2]

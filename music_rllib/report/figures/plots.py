@@ -13,7 +13,7 @@ import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle, product
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -199,12 +199,9 @@ def curve_subplot(
         if metric.target is not None:
             axes.axhline(metric.target, color=mpl.rcParams["axes.edgecolor"], lw=0.8, ls="dotted")
         if legend:
-            short = [(textwrap.fill(label, _LABEL), style) for label, style in legend]
-            handles = legend_handles(short)
-            inside = axes.legend(
-                handles=handles, fontsize="small", framealpha=0.7, edgecolor="none"
-            )
-            inside.set_in_layout(False)
+            handles = legend_handles([(textwrap.fill(one, _LABEL), style) for one, style in legend])
+            look: dict[str, Any] = {"fontsize": "small", "framealpha": 0.7, "edgecolor": "none"}
+            axes.legend(handles=handles, **look).set_in_layout(False)
 
     return Subplot(title=title, draw=draw)
 
@@ -214,12 +211,12 @@ def _draw_curve(axes: Axes, curve: Curve, style: Style, stagger: float) -> None:
     mean = curve.estimate.value
     of_all_runs = np.where(curve.runs == curve.runs.max(), mean, np.nan)
     every = max(1, len(curve.steps) // 8)
-    axes.plot(curve.steps, mean, color=style.color, linestyle=style.line, lw=0.8)
+    look: dict[str, Any] = {"color": style.color, "linestyle": style.line}
+    axes.plot(curve.steps, mean, lw=0.8, **look)
     axes.plot(
         curve.steps,
         of_all_runs,
-        color=style.color,
-        linestyle=style.line,
+        **look,
         lw=1.8,
         marker=style.marker,
         # Markers of lines that coincide are at different points, or smaller on top of larger ones.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import warnings
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -403,14 +404,30 @@ def test_updates_compute_without_denormals(settings: dict[str, Any]) -> None:
     assert torch.tensor(smallest) / 2 > 0  # the caller's arithmetic is not changed
 
 
-def test_learning_rates_of_rllibs_schedulers_are_used() -> None:
-    config = TACConfig().environment("FetchReach-v4").training(**SMALL)
+@pytest.mark.parametrize("alpha", [0.2, {"learned": True, "lr": 1e-3}])
+def test_learning_rates_of_rllibs_schedulers_are_used_and_kept(alpha: Any, tmp_path: Path) -> None:
+    config = TACConfig().environment("FetchReach-v4").training(**SMALL, alpha=alpha)
     config.reporting(min_sample_timesteps_per_iteration=1)
-    halved = functools.partial(torch.optim.lr_scheduler.ExponentialLR, gamma=0.5)
-    algo: TAC = config.experimental(_torch_lr_scheduler_classes=[halved]).build_algo()
+    rising = functools.partial(torch.optim.lr_scheduler.LinearLR, start_factor=0.5, total_iters=4)
+    config.experimental(_torch_lr_scheduler_classes=[rising])
+
+    def rate(algo: TAC) -> float:
+        """The learning rate of all optimizers."""
+        adam = algo.learner_group._learner._adam
+        (found,) = {one.param_groups[0]["lr"] for one in adam.values()}
+        return float(found)
+
+    algo: TAC = config.build_algo()
+    assert rate(algo) == 1e-3 / 2
     for _ in range(4):
         algo.train()
-    assert algo.learner_group._learner._adam["networks"].param_groups[0]["lr"] == 1e-3 / 4
+    assert rate(algo) == pytest.approx(1e-3 * 3 / 4)
+    algo.save_to_path(str(tmp_path))
+    resumed: TAC = config.copy(copy_frozen=False).build_algo()
+    resumed.restore_from_path(str(tmp_path))
+    for one in (algo, resumed):
+        one.train()
+    assert rate(algo) == rate(resumed) == pytest.approx(1e-3 * 7 / 8)
 
 
 def read_only(value: Any) -> Any:

@@ -13,6 +13,7 @@ from ray.rllib.callbacks.callbacks import RLlibCallback
 from ray.rllib.core.learner.torch.torch_learner import TorchLearner
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 from ray.rllib.core.rl_module.torch.torch_rl_module import TorchRLModule
+from ray.tune.registry import ENV_CREATOR, _global_registry
 from torch import nn
 
 from music_rllib import TACConfig, names
@@ -596,11 +597,72 @@ def test_a_bad_setting_is_refused(settings: dict[str, Any], message: str) -> Non
             "entropic_index.follows: success_rate needs evaluations",
         ),
         (lambda c: c.update_from_dict({"entropic_indx": 2.0}), "config: entropic_indx"),
+        (lambda c: c.update_from_dict({"replay": {"capacity": 5}}), "config: replay .*prefix"),
+        (lambda c: c.update_from_dict({"settings": 1}), "config: settings"),
+        (lambda c: c.debugging(seed=-1), r"seed=\.\.\.\) must be >= 0, got -1"),
+        (lambda c: c.training(total_env_steps=-5), "must be >= 1, got -5"),
+        (lambda c: c.training(torch_threads=0), "must be >= 1, got 0"),
+        (lambda c: c.fault_tolerance(ignore_env_runner_failures=True), "would be another run"),
     ],
 )
 def test_contradictory_settings_are_refused(make: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make(TACConfig().environment("Pendulum-v1")).validate()
+
+
+def test_search_spaces_of_tune_stay_in_the_configuration() -> None:
+    space = tune.choice([[0], [1]])
+    config = TACConfig().music(agent_indices=space, surrounding_indices=tune.grid_search([[2]]))
+    assert config.agent_indices is space
+    assert config.surrounding_indices == {"grid_search": [[2]]}
+    assert config.update_from_dict({"framework": "torch", "replay_capacity": 5}).replay_capacity
+
+
+class Shifted(gym.RewardWrapper[Any, Any]):
+    def reward(self, reward: Any) -> float:
+        return 1_000.0
+
+
+def test_a_name_that_is_registered_with_ray_is_the_users_environment() -> None:
+    tune.register_env("Pendulum-v1", lambda _: Shifted(gym.make("Pendulum-v1")))
+    try:
+        algo = build("Pendulum-v1", random_steps=10_000)
+        assert algo.train()["env_runners"]["episode_return_mean"] == 200_000.0
+        algo.stop()
+    finally:
+        _global_registry.unregister(ENV_CREATOR, "Pendulum-v1")
+
+
+def test_delayed_updates_without_rllibs_skipping_of_nans() -> None:
+    config = TACConfig().environment("Pendulum-v1").training(**SMALL, policy_delay=2)
+    config.framework(torch_skip_nan_gradients=False).reporting(min_sample_timesteps_per_iteration=1)
+    algo: TAC = config.build_algo()
+    results = [algo.train() for _ in range(2)][-1]
+    assert results["learners"]["__all_modules__"]["grad_updates"] == algo.grad_updates > 0
+    algo.stop()
+
+
+def test_a_checkpoint_is_restored_with_other_settings(tmp_path: Path) -> None:
+    learned = build("Pendulum-v1", alpha={"learned": True, "lr": 1e-3})
+    for _ in range(2):
+        learned.train()
+    learned.save_to_path(str(tmp_path))
+    fixed = build(
+        "Pendulum-v1",
+        entropic_index={"follows": "shannon_entropy", "points": [[0, 1], [1, 2]]},
+    )
+    fixed.restore_from_path(str(tmp_path))
+    before, after = (algo.learner_group._learner._adam["networks"] for algo in (learned, fixed))
+    for one, other in zip(before.state.values(), after.state.values(), strict=True):
+        assert torch.equal(one["exp_avg_sq"], other["exp_avg_sq"])
+    assert len(fixed.learner_group._learner._module_optimizers["default_policy"]) == 1
+    fixed.train()
+    td_error: dict[str, Any] = {"replay.priority": "td_error"}
+    prioritized = build("Pendulum-v1", **td_error)
+    with pytest.raises(ValueError, match="priority must be that of the checkpoint"):
+        prioritized.restore_from_path(str(tmp_path))
+    for algo in (learned, fixed, prioritized):
+        algo.stop()
 
 
 def test_evaluation_takes_the_mean_action_unless_asked_otherwise() -> None:

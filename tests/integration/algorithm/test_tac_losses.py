@@ -12,9 +12,10 @@ from ray.rllib.core import DEFAULT_MODULE_ID
 from torch import Tensor
 
 from music_rllib import names
-from music_rllib.tac.algorithm import TACConfig, _determinism_without_compiler
+from music_rllib.tac.algorithm import TACConfig
 from music_rllib.tac.diagnostics import NonFiniteLossError, of_updates
 from music_rllib.tac.learner import TACLearner
+from music_rllib.tac.random_state import determinism_without_compiler
 
 OBSERVATION, ACTION, BATCH = 6, 3, 32
 
@@ -27,7 +28,7 @@ def small_learner(
     config = TACConfig().debugging(seed=seed)
     config.training(**{"hidden_sizes": (16, 16), "random_steps": 0, **settings})
     config.environment(observation_space=spaces[0], action_space=spaces[1])
-    with _determinism_without_compiler():
+    with determinism_without_compiler():
         built: TACLearner = config.build_learner(spaces={DEFAULT_MODULE_ID: spaces})
     return built
 
