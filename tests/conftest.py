@@ -69,8 +69,8 @@ hypothesis.settings.register_profile("here", deadline=None, max_examples=50)
 hypothesis.settings.register_profile(
     "ci", deadline=None, max_examples=50, derandomize=True, print_blob=True
 )
-_IN_CI = os.environ.get("CI", "").lower() in ("1", "true")
-hypothesis.settings.load_profile("ci" if _IN_CI else "here")
+IN_CI = os.environ.get("CI", "").lower() in ("1", "true")
+hypothesis.settings.load_profile("ci" if IN_CI else "here")
 
 _TESTS = Path(__file__).parent
 _TIERS = {
@@ -183,7 +183,7 @@ def require_service() -> Callable[[str], Path]:
         if program is not None:
             return program
         reason = f"{service} is not installed (Debian: apt-get install {service})"
-        if _IN_CI:
+        if IN_CI:
             pytest.fail(f"{reason}; with CI=true every service must be there", pytrace=False)
         pytest.skip(reason)
 

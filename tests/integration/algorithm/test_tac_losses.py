@@ -33,6 +33,11 @@ def small_learner(
     return built
 
 
+def test_fractions_of_quantiles_are_the_middles_of_equal_parts() -> None:
+    module = learner(bootstrap="critics", quantiles=4).module[DEFAULT_MODULE_ID].unwrapped()
+    assert module.quantile_fractions.tolist() == [0.125, 0.375, 0.625, 0.875]
+
+
 def learner(**settings: Any) -> TACLearner:
     observations = gym.spaces.Box(-np.inf, np.inf, (OBSERVATION,))
     built = small_learner(observations, ACTION, 3, **{"batch_size": BATCH, **settings})

@@ -17,6 +17,7 @@ from music_rllib.policy import Policy, PolicyNetwork, load_policy
 from music_rllib.policy.rollout import open_task, play
 from music_rllib.policy.video import FORMATS, VideoError, film, find_renderer, write_video
 from music_rllib.program import main
+from tests.conftest import IN_CI
 from tests.integration.conftest import ENVIRONMENTS
 from tests.processes import fresh
 
@@ -117,7 +118,7 @@ def test_numbers_are_checked(good: Path, option: str, capsys: pytest.CaptureFixt
 def needs_a_renderer() -> None:
     name, why_not = find_renderer()
     if name is None:
-        pytest.skip(str(why_not))
+        (pytest.fail if IN_CI else pytest.skip)(str(why_not))
 
 
 def test_success_and_goal_are_in_the_picture(

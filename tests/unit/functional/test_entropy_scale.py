@@ -10,7 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import integrate
 
-from music_rllib.functional.entropy_scale import entropy_pressure, largest_entropy, matched_alpha
+from music_rllib.functional.entropy_scale import (
+    entropy_pressure,
+    largest_entropy,
+    matched_alpha,
+    normalised_alpha,
+)
 from tests.unit.functional.entropies import gaussian_entropy, joint_entropy
 
 FORMS = ["per_dimension", "joint"]
@@ -60,3 +65,16 @@ def test_the_largest_entropy_is_that_of_the_uniform_density(q: float) -> None:
     joint = integrate.dblquad(lambda x, y: summand(x, 0.25), -1, 1, -1, 1)[0]
     assert largest_entropy(q, 3) == pytest.approx(3 * one)
     assert largest_entropy(q, 2, "joint") == pytest.approx(joint)
+
+
+@pytest.mark.parametrize("q", [0.5, 1.5, 2.0, 3.0])
+@pytest.mark.parametrize("actions", [1, 4])
+def test_a_normalised_alpha_weighs_the_largest_entropy_as_at_q_1(q: float, actions: int) -> None:
+    """docs/comparing_q.md: times 1.18 at q = 1.5 and 1.39 at q = 2."""
+    each = (1 - 2 ** (1 - q)) / (q - 1)
+    joint = (1 - 2 ** (actions * (1 - q))) / (q - 1)
+    for form, largest in (("per_dimension", actions * each), ("joint", joint)):
+        expected = 0.3 * actions * math.log(2)
+        assert normalised_alpha(0.3, q, actions, form) * largest == pytest.approx(expected)
+    assert normalised_alpha(1.0, 1.5) == pytest.approx(1.18, abs=0.005)
+    assert normalised_alpha(1.0, 2.0) == pytest.approx(1.39, abs=0.005)

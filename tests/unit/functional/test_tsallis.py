@@ -197,3 +197,12 @@ def test_the_joint_form_uses_its_tangent_below_documented_widths(q: float, width
     for factor, active in ((1.01, False), (0.99, True)):
         log_density = -math.log(factor * width * math.sqrt(2 * math.pi))
         assert bool(bound_active(torch.tensor(4 * log_density), q)) == active
+
+
+@pytest.mark.parametrize("q", [0.5, 1.5, 2.0, 3.0])
+def test_the_joint_form_is_that_of_the_product_of_densities(q: float) -> None:
+    densities = torch.tensor([[0.7, 0.2], [1.3, 0.9]], dtype=torch.float64)
+    found = {form: ln_q_of_policy(densities.log(), q, form) for form in ("joint", "per_dimension")}
+    order = q - 1
+    torch.testing.assert_close(found["joint"], (densities.prod(-1) ** order - 1) / order)
+    torch.testing.assert_close(found["per_dimension"], ((densities**order - 1) / order).sum(-1))

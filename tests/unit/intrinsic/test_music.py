@@ -7,8 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from music_rllib import names
 from music_rllib.intrinsic.estimator import MutualInformationEstimator
-from music_rllib.intrinsic.music import Music
+from music_rllib.intrinsic.music import HELD_OUT_STEPS, Music
 from music_rllib.intrinsic.settings import MusicSettings
 from music_rllib.kernels.adam import FusedAdam
 from music_rllib.replay.trajectories import Trajectory
@@ -85,3 +86,33 @@ def test_priorities_of_the_random_shuffle_are_half_of_the_swaps() -> None:
     assert (drawn <= whole + 1e-12).all()
     # Half of the steps count, each at most 2e-4: the deviation of 50 x 40 sums of 50 steps.
     assert drawn.mean() / whole.mean() == pytest.approx(0.5, abs=0.01)
+
+
+def test_a_priority_is_the_sum_of_the_clipped_bounds_of_its_steps() -> None:
+    one = music("independent", estimator="frozen", prioritise_replay=True)
+    frames = 5.0 * torch.randn(21, 6, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        bounds = one._network.transition_bounds(frames[:-1], frames[1:], (True,))
+    assert bounds.min() < 0
+    assert bounds.max() > 1e-3
+    (found,) = one.priorities([frames], torch.Generator())
+    assert found == pytest.approx(float(bounds.clamp(0.0, 2e-4).sum()))
+
+
+def test_the_bound_on_new_episodes_is_weighted_by_their_steps(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    one = music("independent")
+    monkeypatch.setattr(one._network, "bound", lambda *_: torch.tensor([0.1, 0.4]))
+    episodes = [
+        Trajectory(
+            np.zeros((n + 1, 6), np.float32),
+            np.zeros((n, 2), np.float32),
+            np.zeros(n, np.float32),
+            False,
+        )
+        for n in (30, 1, 10)
+    ]
+    one._measure_held_out(episodes, torch.Generator())
+    assert one.metrics() == {names.HELD_OUT_BOUND: pytest.approx(0.175), HELD_OUT_STEPS: 40}
+    assert one.metrics() == {}

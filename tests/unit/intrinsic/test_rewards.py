@@ -416,3 +416,19 @@ def test_the_checked_settings_are_those_of_the_class(name: str) -> None:
     module, _, cls = BUILT_IN[name].partition(":")
     signature = inspect.signature(getattr(importlib.import_module(module), cls))
     assert tuple(signature.parameters)[1:] == SETTINGS.get(name, ())
+
+
+def test_a_rewards_networks_take_a_step_in_every_fourth_update() -> None:
+    learner = made("rnd")
+    learner.learn(batch(90), 9)
+    assert {float(each["step"]) for each in learner.state()["adam"].values()} == {3.0}
+
+
+@pytest.mark.parametrize("name", ["rnd", "icm", "displacement", "diayn"])
+def test_measuring_fresh_episodes_changes_nothing(name: str) -> None:
+    learner = made(name)
+    learner.learn(batch(), 1)
+    before = learner.weights()
+    learner.observe(batch(seed=1), [])
+    for key, array in learner.weights().items():
+        np.testing.assert_array_equal(array, before[key])

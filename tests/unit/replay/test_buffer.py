@@ -495,3 +495,64 @@ def test_per_forgets_overwritten_rows_and_keeps_hindsight_inside_its_episode() -
     np.testing.assert_array_equal(
         replay.sample_transitions(50).inputs, restored.sample_transitions(50).inputs
     )
+
+
+def per() -> TrajectoryReplay:
+    return TrajectoryReplay(LAYOUT, 20, np.random.default_rng(0), td_exponent=0.5)
+
+
+def test_new_transitions_are_drawn_with_the_largest_priority_so_far() -> None:
+    """Of all errors, not of the last ones; also after a checkpoint (Schaul et al. 2016, alg. 1)."""
+    replay = per()
+    replay.extend([episode(0, 5)])
+    rows = np.unique(replay.sample_transitions(1000).rows)
+    replay.update_priorities(rows, np.array([100, 1, 1, 1, 1], np.float32))
+    replay.update_priorities(rows[1:], np.full(4, 1, np.float32))
+    restored = per()
+    restored.load_state(replay.state())
+    for each in (replay, restored):
+        each.extend([episode(1, 5)])
+        drawn = each.sample_transitions(20_000).actions
+        share = np.mean(drawn[:, 0] == 1)
+        assert share == pytest.approx(50 / (50 + 10 + 4), abs=0.02)
+
+
+def test_a_transition_without_an_error_can_still_be_drawn() -> None:
+    """Its priority is (1e-6)^0.5 = 1e-3."""
+    replay = per()
+    replay.extend([episode(0, 5)])
+    rows = np.unique(replay.sample_transitions(1000).rows)
+    replay.update_priorities(rows, np.array([0, 1e-4, 1e-4, 1e-4, 1e-4], np.float32))
+    share = np.mean(replay.sample_transitions(40_000).rows == rows[0])
+    one, other = 1e-6**0.5, (1e-4 + 1e-6) ** 0.5
+    assert share == pytest.approx(one / (one + 4 * other), rel=0.1)
+
+
+@pytest.mark.parametrize("beta", [0.0, 0.4, 1.0])
+def test_importance_weights_have_the_exponent_that_is_asked_for(beta: float) -> None:
+    replay = per()
+    replay.extend([episode(0, 5)])
+    rows = np.unique(replay.sample_transitions(1000).rows)
+    errors = np.array([1, 4, 9, 16, 25], np.float32)
+    replay.update_priorities(rows, errors)
+    batch = replay.sample_transitions(2000, importance_exponent=beta)
+    probability = np.sqrt(errors) / np.sqrt(errors).sum()
+    expected = dict(zip(rows, (probability / probability.min()) ** -beta, strict=True))
+    assert batch.weights is not None
+    np.testing.assert_allclose(batch.weights, [expected[row] for row in batch.rows], rtol=1e-5)
+
+
+def test_values_of_an_episode_stay_with_its_steps_and_are_restored() -> None:
+    def numbers(number: int, steps: int) -> np.ndarray:
+        return (10 * number + np.arange(steps)).astype(np.float32)
+
+    replay, restored = (TrajectoryReplay(LAYOUT, 10, np.random.default_rng(0)) for _ in range(2))
+    assert replay.values_of(np.zeros(1, np.int64)) is None
+    for number, steps in enumerate((5, 2, 4, 3, 1)):  # beyond the ring's end
+        replay.extend([episode(number, steps)], values=[numbers(number, steps)])
+    restored.load_state(replay.state())
+    for each in (replay, restored):
+        batch = each.sample_transitions(200)
+        np.testing.assert_array_equal(
+            each.values_of(batch.rows), 10 * batch.actions[:, 0] + batch.actions[:, 1]
+        )

@@ -6,25 +6,43 @@ import io
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from rich.console import Console
+from scipy import stats
 
 from music_rllib import names
 from music_rllib.report.figures.choice import drawings_of_stages, study_drawings
 from music_rllib.report.figures.draw import files
-from music_rllib.results.analysis_plan import AnalysisPlan, PlanVersion, checked_plans, with_plan
+from music_rllib.results.analysis import curve
+from music_rllib.results.analysis_plan import (
+    AnalysisPlan,
+    PlanVersion,
+    analysis_plan,
+    checked_plans,
+    with_plan,
+)
 from music_rllib.results.analysis_plan import as_document as plans_as_document
 from music_rllib.results.answer import answer, claim_in_words, power_in_words
-from music_rllib.results.claims import Verdict
+from music_rllib.results.claims import Verdict, contrast, verdict_of
 from music_rllib.results.conditions import find_stages
 from music_rllib.results.data import Points, RunRecord, Sweep, columns
-from music_rllib.results.statistics import Estimate, difference_text, interval_text, p_text
+from music_rllib.results.scores import measure_on, scores_of, with_pretraining
+from music_rllib.results.statistics import (
+    Estimate,
+    difference_text,
+    interval_text,
+    number,
+    p_text,
+    seeds_needed,
+)
 from music_rllib.results.study import Study, alpha_lines, study_of
 from music_rllib.results.tables import study_tables
 from music_rllib.sweep.views.results import console_table
+from tests.sweep_files import loaded
 
 BUDGET = 10_000
 STEPS = np.arange(1000, BUDGET + 1, 1000)
@@ -874,3 +892,264 @@ def test_auc_total_counts_the_steps_of_pretraining(rng: np.random.Generator) -> 
     ]
     (claim,) = study_of(sweep_of(late, with_plan((), planned, 5))).planned
     assert float(claim.contrast.difference.value) == pytest.approx(-0.15, abs=0.03)
+
+
+def test_a_pair_is_a_seed_in_any_order_of_the_runs(rng: np.random.Generator) -> None:
+    runs = study({"1": 0.2, "1.5": 0.4}, 8, rng)
+    (expected,) = study_of(sweep_of(runs, BEFORE)).planned
+    (found,) = study_of(sweep_of([*runs[:8], *reversed(runs[8:])], BEFORE)).planned
+    assert found.contrast.paired
+    assert found.contrast.p_values == pytest.approx(expected.contrast.p_values)
+
+
+def test_both_sides_of_a_verdict_need_five_seeds(rng: np.random.Generator) -> None:
+    runs = study({"1": 0.1, "1.5": 0.4}, 8, rng)
+    del runs[4:8]
+    (claim,) = study_of(sweep_of(runs, BEFORE)).planned
+    assert (claim.contrast.seeds, claim.verdict) == ((8, 4), Verdict.NONE)
+    assert claim.why == "4 seeds: no verdict below 5"
+
+
+def test_a_lower_value_of_a_minimised_metric_is_superior_and_a_failure_the_highest(
+    rng: np.random.Generator,
+) -> None:
+    runs = study({"1": 0.2, "1.5": 0.4}, 8, rng)
+    (claim,) = study_of(sweep_of(runs), metric=names.EVAL_SUCCESS, maximised=False).unplanned
+    assert claim.verdict is Verdict.WORSE
+    runs[0] = (replace(runs[0][0], status="FAILED"), runs[0][1])
+    found = study_of(sweep_of(runs), metric=names.EVAL_SUCCESS, maximised=False)
+    assert found.means[0].scores.by_seed["0"] == 1.0
+    returns = [
+        (
+            one,
+            points._replace(
+                metrics=[{names.EVAL_SUCCESS: "own"}.get(m, m) for m in points.metrics]
+            ),
+        )
+        for one, points in runs
+    ]
+    found = study_of(sweep_of(returns), metric="own", maximised=False)
+    scores = [x for mean in found.means for x in mean.scores.by_seed.values()]
+    assert found.means[0].scores.by_seed["0"] == max(scores) > 0.35
+
+
+def test_equivalence_takes_precedence_over_a_small_difference() -> None:
+    assert verdict_of(0.01, 0.001, 0.001) is Verdict.EQUIVALENT
+
+
+@pytest.mark.parametrize(
+    ("seeds", "far", "margin", "count"),
+    [(16, 7.3, None, 0), (16, 7.5, None, 1), (16, 7.5, 8.0, 0), (15, 99.0, None, 0)],
+)
+def test_a_seed_has_collapsed_at_five_robust_deviations(
+    seeds: int, far: float, margin: float | None, count: int
+) -> None:
+    """Half of the differences at 1 and half at -1: a median absolute deviation of 1."""
+    scores = np.resize([1.0, -1.0], seeds)
+    scores[0] = far
+    found = contrast(scores, 0 * scores, paired=True, margin=margin)
+    assert int(found.collapsed) == count
+
+
+def test_a_margin_of_returns_is_not_one_of_success_rates(rng: np.random.Generator) -> None:
+    plans = with_plan((), plan("q = 1.5 against q = 1", margin=5.0), DONE - 1)
+    (claim,) = study_of(sweep_of(study({"1": 0.2, "1.5": 0.4}, 8, rng), plans)).planned
+    assert claim.margin == 0.05
+
+
+def test_tasks_of_other_budgets_are_averaged_over_the_budget(rng: np.random.Generator) -> None:
+    runs = [
+        x
+        for t in ("FetchPush", "FetchSlide")
+        for x in cells(rng, 5, ("1", 0.2), ("1.5", 0.4), task=t)
+    ]
+    budget = {"FetchPush": BUDGET, "FetchSlide": BUDGET // 2}
+    plans = with_plan((), plan("q = 1.5 against q = 1", budget=budget), DONE - 1)
+    words = {one.task: one.measure.words for one in study_of(sweep_of(runs, plans)).planned}
+    assert words == {
+        "all tasks": "mean success over the budget",
+        "FetchPush": "mean success over 10,000 steps",
+        "FetchSlide": "mean success over 5,000 steps",
+    }
+
+
+def test_seeds_that_tie_on_two_tasks_have_the_error_of_their_episodes() -> None:
+    rng = np.random.default_rng(0)
+    runs = [
+        x
+        for t in ("FetchPush", "FetchSlide")
+        for x in cells(rng, 5, ("1", 0.0), ("1.5", 0.0), task=t)
+    ]
+    budget = dict.fromkeys(("FetchPush", "FetchSlide"), BUDGET)
+    plans = with_plan((), plan("q = 1.5 against q = 1", budget=budget), DONE - 1)
+    both, *_ = study_of(sweep_of(runs, plans)).planned
+    rate = 0.5 / (EPISODES + 1)
+    of_a_score = rate * (1 - rate) / (EPISODES * len(STEPS))
+    error = np.sqrt(2 * (2 * of_a_score / 2**2) / 5)  # two sides; two tasks; five seeds
+    half = stats.t.ppf(0.95, 4) * error
+    assert float(both.contrast.within.upper) == pytest.approx(half)
+
+
+@pytest.mark.parametrize("reward_range, worst", [("[1.0, 2.0]", 1.0), ("[-2.0, 3.0]", -100.0)])
+def test_the_smallest_return_of_a_positive_reward_is_that_of_one_step(
+    reward_range: str, worst: float
+) -> None:
+    record, _ = run({"tac.entropic_index": "1"}, 0, 0.3, np.random.default_rng(0))
+    params = {"task.success_key": "None", "task.reward_range": reward_range, "task.horizon": "50"}
+    record = replace(record, params={**record.params, **params}, status="FAILED")
+    points = Points([names.EVAL_RETURN], [BUDGET], [DONE], [60.0])
+    other = replace(record, status="FINISHED", tags={**record.tags, names.TAG_SEED: "1"})
+    (mean,) = study_of(sweep_of([(record, points), (other, points)])).means
+    assert mean.scores.by_seed["0"] == worst
+
+
+def test_only_episodes_up_to_the_compared_budget_count(rng: np.random.Generator) -> None:
+    plans = with_plan((), plan("q = 1.5 against q = 1", budget={"FetchPush": 4000}), DONE - 1)
+    sweep = sweep_of(study({"1": 0.2, "1.5": 0.4}, 5, rng), plans)
+
+    (stage,) = find_stages(sweep)
+    measure = measure_on(sweep, "FetchPush", stage.runs, "auc", horizon=4000)
+    assert scores_of(sweep, stage.conditions[0], "FetchPush", measure).episodes == 4 * EPISODES
+
+
+def test_steps_after_the_budget_of_a_pretraining_do_not_count(rng: np.random.Generator) -> None:
+    q = {"tac.entropic_index": "1"}
+    before, points = run(q, 0, 0.1, rng, stage="u", **{names.TAG_NODE_KEY: "u0"})
+    late = points._replace(steps=[step + 30 * (step == BUDGET) for step in points.steps])
+    after = run(q, 0, 0.4, rng, stage="r", **{names.TAG_SOURCE_NODE: "u0"})
+    steps, _ = with_pretraining(sweep_of([(before, late), after])).series(1, names.EVAL_SUCCESS)
+    assert steps.tolist() == [*STEPS[:-1], *(BUDGET + STEPS)]
+    # An evaluation at the budget, and one of the second run at its step 0: the later one counts.
+    start = after[1]._replace(steps=[step - 1000 for step in after[1].steps])
+    sweep = with_pretraining(sweep_of([(before, points), (after[0], start)]))
+    steps, values = sweep.series(1, names.EVAL_SUCCESS)
+    assert steps.tolist() == [*STEPS, *(BUDGET + STEPS[:-1])]
+    assert values[len(STEPS) - 1] == start.values[len(STEPS)]
+
+
+def test_a_result_is_there_when_its_run_has_ended(rng: np.random.Generator) -> None:
+    """A plan may be recorded while runs train, until the last evaluation of the first that ends."""
+    runs = [
+        (one, points._replace(times=[DONE - 1000 + s // 10 for s in points.steps]))
+        for one, points in study({"1": 0.2, "1.5": 0.4}, 5, rng)
+    ]
+    for at, planned in ((DONE - 1, 1), (DONE, 0)):
+        sweep = sweep_of(runs, with_plan((), plan("q = 1.5 against q = 1"), at))
+        assert len(study_of(sweep).planned) == planned
+
+
+@pytest.mark.parametrize("paired", [True, False])
+@pytest.mark.parametrize("level", [0.05, 0.05 / 6])
+@pytest.mark.parametrize("size", [0.05, 0.1])
+def test_the_planned_number_of_seeds_has_80_percent_power_and_one_less_has_not(
+    paired: bool, level: float, size: float
+) -> None:
+    rng, spread, draws = np.random.default_rng(0), 0.06, 20_000
+    seeds, _ = seeds_needed(size, spread, paired=paired, level=level)
+    assert seeds is not None
+
+    def power(n: int) -> float:
+        if paired:
+            p = stats.ttest_1samp(rng.normal(size, spread, (n, draws)), 0).pvalue
+        else:
+            own = spread / np.sqrt(2)
+            p = stats.ttest_ind(
+                rng.normal(size, own, (n, draws)), rng.normal(0, own, (n, draws))
+            ).pvalue
+        return float(np.mean(p < level))
+
+    assert power(seeds) > 0.79
+    assert power(seeds - 1) < 0.81
+
+
+def test_a_curve_has_no_value_after_the_last_evaluation_of_a_run(rng: np.random.Generator) -> None:
+    """A run that failed early does not go on at its last value."""
+
+    def points(*rates: float) -> Points:
+        steps = [1000 * (i + 1) for i in range(len(rates))]
+        return Points([names.EVAL_SUCCESS] * len(rates), steps, [DONE] * len(rates), list(rates))
+
+    runs = [
+        (run({"tac.entropic_index": "1"}, seed, 0.3, rng)[0], p)
+        for seed, p in enumerate((points(0.2, 0.4, 0.9), points(0.4, 0.6)))
+    ]
+    sweep = sweep_of(runs)
+    found = curve(sweep, find_stages(sweep)[0].conditions[0], "FetchPush", names.EVAL_SUCCESS)
+    assert found is not None
+    np.testing.assert_allclose(found.estimate.value, [0.3, 0.5, 0.9])
+    assert found.runs.tolist() == [2, 2, 1]
+
+
+def test_seeds_needed_are_those_of_the_whole_family(rng: np.random.Generator) -> None:
+
+    runs = study({"1": 0.3, "1.5": 0.33, "2": 0.31}, 6, rng, spread=0.06)
+    sweep = sweep_of(runs)
+    found = study_of(sweep)
+    values = {m.condition.entropic_index: m.scores.by_seed for m in found.means}
+    pairs = (("1.5", "1"), ("2", "1"), ("2", "1.5"))
+    gaps = [np.std([values[a][k] - values[b][k] for k in values[a]], ddof=1) for a, b in pairs]
+    spread = float(np.sqrt(np.mean(np.square(gaps))))
+    one, other = seeds_needed(0.05, spread, paired=True, level=0.05 / 3)
+    said = " ".join(answer(sweep, found))
+    assert (
+        f"differences is {number(spread)}: for 80% power, a difference of 0.05 needs {one} seeds, "
+        f"and equivalence within it needs {other} seeds."
+    ) in said
+
+
+def test_planned_fresh_seeds_that_have_not_begun_count_as_unfinished(
+    rng: np.random.Generator,
+) -> None:
+    runs = [
+        run({"tac.entropic_index": q}, 10**6 + seed, height, rng, part="final0")
+        for q, height in (("1", 0.2), ("1.5", 0.4))
+        for seed in range(6)
+    ]
+    asked = plan("q = 1.5 against q = 1", seeds="8 fresh ones; 0, 1 for the tuning")
+    (claim,) = study_of(sweep_of(runs, with_plan((), asked, 5))).planned
+    assert claim.why == "4 of 16 planned runs are not finished"
+
+
+def test_versions_are_read_in_the_order_of_their_times() -> None:
+    versions = with_plan(
+        with_plan((), plan("q = 2 against q = 1"), 5), plan("q = 3 against q = 1"), 7
+    )
+    assert checked_plans(plans_as_document(versions)[::-1]) == versions
+
+
+def test_a_plan_has_hypotheses() -> None:
+    with pytest.raises(ValueError, match="must be two different conditions"):
+        plan("q is large")
+
+
+@pytest.mark.parametrize("budgets", [(5000, 9000), (9000, 5000)])
+def test_stages_are_compared_over_their_smallest_budget(
+    budgets: tuple[int, int], tmp_path: Path
+) -> None:
+    stages = [
+        {"name": n, "variant": "tac", "env_steps": s} for n, s in zip("ab", budgets, strict=True)
+    ]
+    document: dict[str, Any] = {"name": "s", "tasks": ["FetchPush"], "stages": stages}
+    document["analysis"] = {"hypotheses": ["stage = b against stage = a"]}
+    found = analysis_plan(loaded(tmp_path, document))
+    assert found is not None
+    assert found.budget == {"FetchPush": 5000}
+
+
+def test_all_stages_before_a_stage_count_in_auc_total(tmp_path: Path) -> None:
+    stages = [
+        {"name": "u", "variant": "music-u", "env_steps": 4000},
+        {"name": "m", "variant": "music-r", "init_from": "u", "env_steps": 5000},
+        {
+            "name": "f",
+            "variant": "music-f",
+            "init_from": "m",
+            "env_steps": 6000,
+            "grid": {"tac.entropic_index": [1.0, 2.0]},
+        },
+    ]
+    document: dict[str, Any] = {"name": "s", "tasks": ["FetchPush"], "stages": stages}
+    document["analysis"] = {"hypotheses": ["q = 2 against q = 1"], "metric": "auc_total"}
+    found = analysis_plan(loaded(tmp_path, document))
+    assert found is not None
+    assert found.budget == {"FetchPush": 15_000}

@@ -11,13 +11,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from pydantic import ValidationError
+from scipy import stats
 
 from music_rllib import names
 from music_rllib.config.load import load_config, warnings_of
 from music_rllib.config.problems import ConfigError
 from music_rllib.config.search import Objective, Pruning, Rung, SearchSettings
-from music_rllib.search.objective import aggregate, reason_to_prune, score
+from music_rllib.search.objective import aggregate, interval, reason_to_prune, score, up_to
 from music_rllib.search.sampler import VALUES, Proposer, trial_at
 from music_rllib.search.study import fits
 from music_rllib.store.history import Report
@@ -461,3 +463,76 @@ def test_a_search_with_few_points_prints_its_last_trial(tmp_path: Path) -> None:
     assert line == (
         "finetune: search.trials is 20, and the space has 9 points: the search ends after 9 trials"
     )
+
+
+def scores(*seeds: float) -> NDArray[np.float64]:
+    return np.array(seeds, float)[:, None]
+
+
+def reason(
+    mine: NDArray[np.float64], others: Mapping[int, NDArray[np.float64]], **pruning: float
+) -> str | None:
+    rules = Pruning(rungs=(Rung(seeds=2),), **pruning)
+    return reason_to_prune(Objective(), rules, scores=mine, others=others, rung="here")
+
+
+def test_a_trial_in_the_best_share_continues_far_below_the_best() -> None:
+    """Five trials: a share of 0.3 is rounded up to two of them."""
+    others = {0: scores(0.9, 0.9), 1: scores(0.1, 0.1), 2: scores(0.2, 0.2), 3: scores(0.25, 0.25)}
+    assert reason(scores(0.3, 0.3), others, keep=0.3) is None
+    assert reason(scores(0.24, 0.24), others, keep=0.3) is not None
+    assert reason(scores(0.3, 0.3), others, keep=0.2) is not None
+
+
+@pytest.mark.parametrize("confidence", [0.8, 0.95])
+def test_the_interval_that_is_compared_has_the_configured_confidence(confidence: float) -> None:
+    others = {0: scores(9.0, 9.2), 1: scores(9.1, 9.4)}
+    found = reason(scores(0.0, 0.1), others, keep=0.3, confidence=confidence)
+    variance = (2 * 0.1**2 + 2 * 0.15**2 + 2 * 0.05**2) / 3
+    half = stats.t.ppf((1 + confidence) / 2, 3) * np.sqrt(variance / 2)
+    assert f"its {100 * confidence:.0f}% interval [{0.05 - half:.4g}, {0.05 + half:.4g}]" in str(
+        found
+    )
+
+
+@pytest.mark.parametrize(
+    ("how", "runs"), [("mean", 8), ("iqm", 4), ("median", 4 * 2 / np.pi), ("worst_task", 4)]
+)
+def test_the_interval_of_a_trial_is_students_over_its_effective_runs(how: str, runs: float) -> None:
+    values = np.array([[0.0, 10.0], [1.0, 12.0], [2.0, 11.0], [3.0, 13.0]])
+    found = interval(Objective(metric=names.EVAL_RETURN, aggregate=how), values)
+    own = values[:, :1] if how == "worst_task" else values
+    freedom = own.size - own.shape[1]
+    variance = ((own - own.mean(0)) ** 2).sum() / freedom
+    half = stats.t.ppf(0.975, freedom) * np.sqrt(variance / runs)
+    assert float(found.upper - found.value) == pytest.approx(half)
+
+
+def report(steps: int, **metrics: float) -> Report:
+    return Report(env_steps=steps, seconds=0, timestamp_ms=0, metrics=metrics)
+
+
+def test_a_rung_ends_with_the_first_evaluation_at_its_steps() -> None:
+    evaluated = {names.EVAL_EPISODES: 5.0}
+    history = [
+        report(1000, **evaluated),
+        report(2000),
+        report(2500, **evaluated),
+        report(3000, **evaluated),
+    ]
+    assert [one.env_steps for one in up_to(history, 2000)] == [1000, 2000, 2500]
+    assert up_to(history, None) == history
+
+
+def test_the_best_value_of_a_minimised_objective_is_the_smallest() -> None:
+    history = [report(at, **{names.EVAL_SUCCESS: v}) for at, v in ((1, 0.5), (2, 0.2), (3, 0.4))]
+    assert score(Objective(read="best", direction="minimize"), history, 3) == 0.2
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_run_without_a_finite_score_is_named(bad: float) -> None:
+    history = [report(1, **{names.EVAL_SUCCESS: 0.5}), report(2, **{names.EVAL_SUCCESS: bad})]
+    with pytest.raises(ValueError, match="is not a finite number"):
+        score(Objective(), history, 3)
+    with pytest.raises(ValueError, match="never reported evaluation/success_rate"):
+        score(Objective(), [report(1)], 3)

@@ -13,6 +13,7 @@ from hypothesis.extra import numpy as arrays_of
 
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.store.handoff import (
+    Architecture,
     HandoffError,
     NetworkWeights,
     open_handoff,
@@ -155,3 +156,21 @@ def test_the_content_hash_depends_on_weights_and_task_only(tmp_path: Path) -> No
     assert content_hash("c", WEIGHTS, task=SLIDE) != one
     shifted = {**WEIGHTS, "normaliser": {"mean": np.zeros(5)}}
     assert content_hash("d", shifted) != one
+
+
+@pytest.mark.parametrize(("policy", "critics"), [("stochastic", 2), ("deterministic", 1)])
+def test_the_default_number_of_critics_is_that_of_the_policy(policy: str, critics: int) -> None:
+    def made(number: int | None) -> Architecture:
+        return Architecture(
+            hidden_sizes=(8,),
+            policy=policy,
+            bootstrap="critics",
+            normalise_observations=True,
+            estimator_hidden_size=8,
+            log_std_form="clamp",
+            log_std_bounds=None,
+            critics=number,
+        )
+
+    assert made(None).differences(made(critics), "policy") == []
+    assert made(None).differences(made(3), "policy") == ["tac.critics"]

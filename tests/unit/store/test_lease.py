@@ -11,13 +11,21 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pyarrow.fs as pafs
 import pytest
 
 from music_rllib.store import lease as lease_module
-from music_rllib.store.lease import HeldLease, Lease, LeaseFile, LeaseLostError, runs_here
+from music_rllib.store.lease import (
+    HeldLease,
+    Lease,
+    LeaseFile,
+    LeaseLostError,
+    process_start,
+    runs_here,
+)
 from music_rllib.store.storage import StorageError, StorageFolder, open_storage
 from tests.processes import wait_until
 
@@ -144,14 +152,16 @@ def test_a_live_owner_keeps_its_lease_when_the_clock_jumps(
 ) -> None:
     """After a jump, the lease is renewed at once with the new time."""
     monkeypatch.setattr(lease_module, "LOOK_SECONDS", 0.1)
-    mine, day, jump = Lease.of_this_process("mine"), time.time, [0.0]
+    # The regular renewal is due after 150 s.
+    mine, day, jump = Lease.of_this_process("mine", 600.0), time.time, [0.0]
     place.acquire(mine)
     monkeypatch.setattr(time, "time", lambda: day() + jump[0])
     held = HeldLease(place, mine)
     for hours in (1, -1):
+        time.sleep(0.5)  # the thread has noted the time before the jump
         jump[0] = 3600.0 * hours
         deadline = time.monotonic() + 30
-        while (now := place.read()) is None or not 0 < now.seconds <= 60:
+        while (now := place.read()) is None or not 0 < now.seconds <= 600:
             assert time.monotonic() < deadline
             time.sleep(0.05)
         assert now.holds(), "the clock does not change the process"
@@ -253,3 +263,61 @@ def test_a_process_is_recognized_after_the_clock_changed(
         assert mine.holds()
         assert runs_here(mine.pid, mine.process_started)
     assert not runs_here(mine.pid, mine.process_started + 5), "another process with the same id"
+
+
+def test_the_last_of_two_writers_has_the_lease_of_a_bucket(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "bucket" / "work").mkdir(parents=True)
+    filesystem = pafs.SubTreeFileSystem(str(tmp_path), pafs.LocalFileSystem())
+    file = LeaseFile(StorageFolder(filesystem, "bucket/work"), "lease.json")
+    theirs = elsewhere()
+    # The other one writes between this one's write and its second look.
+    monkeypatch.setattr(time, "sleep", lambda _: file._write(theirs))
+    assert file.acquire(Lease.of_this_process("mine")) == theirs
+
+
+def test_a_zombie_does_not_hold_a_lease() -> None:
+    """A killed worker whose parent has not waited for it, as in a container without an init."""
+    child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    started = process_start(child.pid)
+    assert runs_here(child.pid, started)
+    child.kill()
+    wait_until(lambda: not runs_here(child.pid, started), 10)
+    assert child.returncode is None, "nobody has waited for it"
+    child.wait()
+
+
+def test_an_owner_that_waited_for_the_lock_writes_nothing_any_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another process took the lease over between the look and the lock."""
+    file = LeaseFile(open_storage(str(tmp_path)), "lease.json")
+    mine, theirs = Lease.of_this_process("mine"), elsewhere()
+    assert file.acquire(mine) is None
+    locked = LeaseFile._locked
+
+    def late(self: LeaseFile, attempts: int = 1) -> Any:
+        self._write(theirs)
+        return locked(self, attempts)
+
+    monkeypatch.setattr(LeaseFile, "_locked", late)
+    assert not file.renew(mine)
+    assert file.read() == theirs
+    file.release(mine.owner)
+    assert file.read() == theirs
+
+
+def test_a_lease_that_was_acquired_while_this_process_waited_for_the_lock_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = LeaseFile(open_storage(str(tmp_path)), "lease.json")
+    theirs, locked = elsewhere(), LeaseFile._locked
+
+    def late(self: LeaseFile, attempts: int = 1) -> Any:
+        self._write(theirs)
+        return locked(self, attempts)
+
+    monkeypatch.setattr(LeaseFile, "_locked", late)
+    assert file.acquire(Lease.of_this_process("mine")) == theirs
+    assert file.read() == theirs

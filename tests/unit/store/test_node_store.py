@@ -463,3 +463,41 @@ def test_an_atomic_write_leaves_no_trace_when_it_fails(tmp_path: Path) -> None:
         write_atomically(path, "text")  # type: ignore[arg-type]
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_newest_checkpoint_up_to_a_number_of_steps_is_found(store: NodeStore) -> None:
+    work = store.work_folder(KEY, 3)
+    for steps in (1000, 2000, 3000):
+        with work.new_checkpoint(steps) as draft:
+            (draft.folder / "state").write_text(str(steps))
+    for most, expected in ((None, "3000"), (3000, "3000"), (2999, "2000"), (999, None)):
+        with work.newest(most=most) as saved:
+            assert (saved and (saved.folder / "state").read_text()) == expected
+
+
+def test_tidying_one_node_leaves_the_drafts_of_others(tmp_path: Path) -> None:
+    from music_rllib.store.sealed import SealedFolders
+
+    nodes = SealedFolders(open_storage(str(tmp_path)))
+    killed = tmp_path / f".mine.{'0' * 32}"
+    killed.mkdir()
+    with nodes.sealing("other", {}) as draft:
+        (draft / "file").write_text("x")
+        nodes.tidy("mine")
+        assert not killed.exists()
+    assert nodes.read("other", "file") == b"x"
+
+
+def test_the_reports_of_an_interrupted_run_are_those_of_the_newest_sound_checkpoint(
+    store: NodeStore,
+) -> None:
+    from music_rllib.store.history import HISTORY
+
+    work = store.work_folder(KEY)
+    assert work.lines() == b""
+    for steps in (1000, 2000):
+        with work.new_checkpoint(steps) as draft:
+            (draft.folder / HISTORY).write_text(str(steps))
+    assert work.lines() == b"2000"
+    work.folder.write(f"{work.names()[-1]}/manifest.json", b"damage")
+    assert work.lines() == b"1000"

@@ -1073,3 +1073,24 @@ def test_slurm_writes_a_job_array_and_submits_it(
     ):
         refused = program(*command, wrong)
         assert (refused.code, said in refused.errors) == (2, True)
+
+
+def test_plan_names_only_new_hypotheses_about_stages_with_results(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    played(storage, tmp_path, runs=1)
+    later = {**SWEEP["stages"][0], "name": "later", "tac": {"lr": 0.002}}
+    one, other = (f"stage = {s}, q = 1.5 against stage = {s}, q = 1" for s in ("train", "later"))
+
+    def said(*hypotheses: str, **changes: object) -> str:
+        analysis = {"hypotheses": list(hypotheses), **changes}
+        document = {**SWEEP, "storage": storage, "stages": [*SWEEP["stages"], later]}
+        (tmp_path / "planned.yaml").write_text(yaml.safe_dump({**document, "analysis": analysis}))
+        output = in_one_line(program("plan", str(tmp_path / "planned.yaml")).output)
+        return output.partition("Not planned by this version")[2]
+
+    first = said(one, other)
+    assert one in first
+    assert other not in first
+    assert said(one, other, question="Why?") == "", "an earlier version had both"
+    assert one in said(one, other, margin=0.2), "that is another test of it"
