@@ -58,7 +58,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@echo "$(VENV) is ready"
 
 sweep: venv  ## train the packaged sweep and write its report (minutes)
-	@$(BIN)/python -m music_rllib.sweep $(if $(CONFIG),"$(CONFIG)")
+	@$(BIN)/python -m music_rllib.sweep $(CONFIG)
 
 test: venv  ## run the whole suite (CI=true: a missing service is a failure, not a skip)
 	@$(PYTEST) $(PYTEST_ARGS)

@@ -29,7 +29,7 @@ def one_line(error: BaseException) -> str:
 
 def reason_of(error: Exception) -> str:
     """What is wrong with a file: a validation's first finding, or the first line of an error."""
-    if findings := getattr(error, "errors", None):  # of pydantic
+    if callable(findings := getattr(error, "errors", None)):  # of pydantic
         finding = findings(include_url=False)[0]
         place = ".".join(map(str, finding["loc"]))
         text = f"{finding['msg'].replace('Input should', 'must')}, got {finding['input']!r}"

@@ -84,7 +84,6 @@ _SECRET_KEY = re.compile(rf"{_NAMES}|{_SHORT_NAMES}", re.I)
 _COUNTED_KEY = re.compile(r"tokens?", re.I)
 """A number under such a name is a count or an id."""
 _KEYED_BY_TASK = ("environments", "per_task")
-_OF_A_CLASS = ("env_id", "reward")
 _CLASS = re.compile(r"[\w.]+:[\w./-]+")
 """A module and what it has: `token_world:TokenWorld-v0` has no secret."""
 _NOT_IN_A_NAME = re.compile(r"[^\w./\- ]")
@@ -125,14 +124,16 @@ def for_people(text: object) -> str:
     return printable(redact(str(text)))
 
 
-def without_secrets(settings: Mapping[str, object], *, of_tasks: bool = False) -> dict[str, object]:
+def without_secrets(
+    settings: Mapping[str, object], *, of_tasks: bool = False, path: tuple[str, ...] = ()
+) -> dict[str, object]:
     """A copy of nested ``settings`` with redacted text and without keys that name a secret.
 
     A key names a secret if it contains a word of `redact`. ``n_tokens: 4`` and the names of tasks,
-    which are the keys if ``of_tasks``, are not secrets.
+    which are the keys if ``of_tasks``, are not secrets. ``path`` are the keys above.
     """
     return {
-        str(key): _clean(str(key), value)
+        str(key): _clean((*path, str(key)), value)
         for key, value in settings.items()
         if of_tasks or not _is_secret(str(key), value)
     }
@@ -144,15 +145,24 @@ def _is_secret(key: str, value: object) -> bool:
     return _SECRET_KEY.search(key) is not None
 
 
-def _clean(key: str, value: object) -> object:
+def _clean(path: tuple[str, ...], value: object) -> object:
     if isinstance(value, Mapping):
-        return without_secrets(value, of_tasks=key in _KEYED_BY_TASK)
+        return without_secrets(value, of_tasks=path[-1] in _KEYED_BY_TASK, path=path)
     if isinstance(value, (list, tuple)):
-        return [_clean(key, item) for item in value]
+        return [_clean((*path, ""), item) for item in value]
     if not isinstance(value, str):
         return value
-    names_a_class = key.rpartition(".")[2] in _OF_A_CLASS and _CLASS.fullmatch(value)
-    return value if names_a_class else redact(value)
+    if _names_a_class(path) and _CLASS.fullmatch(value):
+        return ":".join(map(redact, value.split(":")))
+    return redact(value)
+
+
+def _names_a_class(path: tuple[str, ...]) -> bool:
+    """Whether a setting is an environment's id or an intrinsic reward."""
+    if "env_kwargs" in path:
+        return False
+    of_reward = "intrinsic.reward" in path or path[-2:] == ("intrinsic", "reward")
+    return of_reward or (path[-1] == "env_id" and path[0] in ("environments", "task"))
 
 
 def flat_params(settings: Mapping[str, object]) -> dict[str, str]:

@@ -270,7 +270,7 @@ def lay_overrides(document: Document, overrides: Mapping[str, Any]) -> None:
         place, value = places[key], left[key]
         if place[0] in LAYER_KEYS:
             for stage in _stages(document):
-                _check_not_varied(stage, key, value)
+                _check_not_varied(stage, key, value, key)
                 _remove(place, stage, *_layers_of_tasks(stage))
             place = ("defaults", *place)
         elif place[0] == "stages":
@@ -280,8 +280,9 @@ def lay_overrides(document: Document, overrides: Mapping[str, Any]) -> None:
                 setting, layers = setting[2:], []
             if setting and setting[0] in LAYER_KEYS:
                 is_group = setting[-1] in SECTIONS and isinstance(value, dict)
-                for one in [(*setting, name) for name in value] if is_group else [setting]:
-                    _check_not_varied(stage, ".".join(map(str, one)), value)
+                for name, inner in value.items() if is_group else [("", value)]:
+                    one = (*setting, name) if name else setting
+                    _check_not_varied(stage, ".".join(map(str, one)), inner, key)
                     _remove(one, *layers)
         document.put(place, value)
 
@@ -308,7 +309,8 @@ def _remove(place: KeyPath, *layers: Any) -> None:
             group.pop(place[-1], None)
 
 
-def _check_not_varied(stage: Mapping[str, Any], key: str, value: Any) -> None:
+def _check_not_varied(stage: Mapping[str, Any], key: str, value: Any, typed: str) -> None:
+    """Refuse the setting `key` of the argument `typed` if the stage varies it."""
     for group in (("grid",), ("search", "space"), ("search", "compare")):
         varied = find(stage, group)
         for name, choices in varied.items() if isinstance(varied, dict) else ():
@@ -317,7 +319,7 @@ def _check_not_varied(stage: Mapping[str, Any], key: str, value: Any) -> None:
             settings = varied_by(str(name).rpartition(":")[2], choices)
             if any(is_in(key, one) or is_in(one, key) for one in settings):
                 place = f"stages.{stage.get('name')}.{'.'.join(group)}.{name}"
-                rule = f"{key} must not be given where {place} varies it"
+                rule = f"{typed} must not be given where {place} varies it"
                 if group == ("grid",) and name == key:
                     # A list is several values, unless a value is a list, as of hidden_sizes.
                     lists = any(isinstance(one, list) for one in choices)

@@ -51,8 +51,10 @@ def _kept_generators() -> Iterator[None]:
     numpy_state, state = np.random.get_state(), random.getstate()  # noqa: NPY002
     torch = sys.modules.get("torch")
     torch_state = torch.get_rng_state() if torch else None
-    yield
-    np.random.set_state(numpy_state)  # noqa: NPY002
-    random.setstate(state)
-    if torch:
-        torch.set_rng_state(torch_state)
+    try:
+        yield
+    finally:
+        np.random.set_state(numpy_state)  # noqa: NPY002
+        random.setstate(state)
+        if torch:
+            torch.set_rng_state(torch_state)

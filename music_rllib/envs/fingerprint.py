@@ -329,7 +329,9 @@ def _files_of_arguments(arguments: Any) -> dict[str, str]:
         for name, value in itertools.chain(*parts):
             # Files of different folders may have the same name.
             other = found.get(name, value)
-            found[name] = value if other == value else _hash((other + value).encode())
+            found[name] = (
+                value if other == value else _hash("".join(sorted((other, value))).encode())
+            )
         return found
     if not isinstance(arguments, str) or len(arguments) > 1000 or "." not in arguments:
         return {}

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,7 +21,7 @@ from music_rllib.envs.values import (
     observation_sizes,
     success_of,
 )
-from music_rllib.errors import reason_of
+from music_rllib.errors import first_line, one_line
 from music_rllib.policy.policy import Policy, PolicyError, unknown_environment
 
 
@@ -62,7 +63,7 @@ def open_task(policy: Policy, **options: Any) -> Env:
         env = make_env(known.env_id, **{**known.kwargs, **options})
     except Exception as error:  # of the user's own constructor
         raise PolicyError(
-            f"the environment {known.env_id} must be there: {reason_of(error)}"
+            f"the environment {known.env_id} must be there: {_reason(error)}"
         ) from error
     try:
         _check_fit(policy, env)
@@ -107,7 +108,13 @@ def _named(env: Env, seed: int, step: int) -> Iterator[None]:
         yield
     except Exception as error:  # of the user's own code
         place = f"{name_of(env)}, episode with seed {seed}, step {step}"
-        raise PolicyError(f"{place}: {reason_of(error)}") from error
+        raise PolicyError(f"{place}: {_reason(error)}") from error
+
+
+def _reason(error: Exception) -> str:
+    """The message of an error; with its type if the message may not say enough."""
+    plain = isinstance(error, ValueError | ImportError | gym.error.Error)
+    return first_line(error) if plain else one_line(error)
 
 
 def _episode(

@@ -123,10 +123,10 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
             vector_index=vector_index,
             num_workers=self.num_workers,
         )
+        name = self.config.env
         # A name that is registered with Ray is the user's own environment, as in RLlib.
-        own = _global_registry.contains(ENV_CREATOR, self.config.env)
-        if is_gymnasium_id(self.config.env) and not own:
-            env = make_env(self.config.env, **context)
+        if is_gymnasium_id(name) and not _global_registry.contains(ENV_CREATOR, name):
+            env = make_env(name, **context)
         else:
             assert self._env_creator is not None
             env = self._env_creator(context)

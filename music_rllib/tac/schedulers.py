@@ -21,7 +21,7 @@ def add_schedulers(learner: TorchLearner) -> None:
             name: [make(learner.get_optimizer(module, name)) for make in own] for name in optimizers
         }
         for module, optimizers in learner._module_optimizers.items()
-        if (own := classes.get(module, ()) if isinstance(classes, Mapping) else classes)
+        for own in [classes.get(module, ()) if isinstance(classes, Mapping) else classes]
     }
 
 

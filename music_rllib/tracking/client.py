@@ -159,8 +159,10 @@ class Experiment:
 
     def delete(self, node_key: str) -> None:
         """Delete a node's run, if there is one, so that it can still be restored."""
-        if self.find(node_key) is not None and self.known is not None:
-            self.client.delete_run(self.known.pop(node_key).run_id)
+        if (run := self.find(node_key)) is not None:
+            self.client.delete_run(run.run_id)
+            if self.known is not None:
+                self.known.pop(node_key, None)
 
     def known_id(self, node_key: str) -> str | None:
         """Run id of a node whose run was found or created before; sends no request."""
@@ -232,8 +234,12 @@ class Experiment:
 
     def _end_abandoned(self, run_id: str) -> None:
         """End a run whose driver was killed, unless it has ended since it was listed."""
-        if self.client.get_run(run_id).info.status == "RUNNING":
-            self.client.set_terminated(run_id, "KILLED")
+        try:
+            if self.client.get_run(run_id).info.status == "RUNNING":
+                self.client.set_terminated(run_id, "KILLED")
+        except MlflowException as error:
+            if not is_lasting(error):  # otherwise the run was deleted
+                raise
 
     def correct(self, run: KnownRun, tags: Mapping[str, str]) -> None:
         """Set those of the tags of an existing run that it has otherwise or not at all."""

@@ -41,8 +41,9 @@ class StoredRun(NamedTuple):
 
 _PLACE = (
     MLFLOW_RUN_NAME, names.TAG_LABEL, names.TAG_STAGE, names.TAG_TRIAL, names.TAG_PART,
+    names.TAG_RESULT,
 )  # fmt: skip
-"""Tags of a run's place in its sweep, which no result depends on."""
+"""Tags of a run's place in its sweep, which no result depends on; and a tag that old runs lack."""
 
 
 class RunQueue:
@@ -67,8 +68,8 @@ class RunQueue:
         self.node_key = node_key
         self.refused: str | None = None
         """Reason of a lasting failure, after which nothing more is sent."""
-        self.unclear = 0
-        """Number of failures in a row that may pass or not."""
+        self.unclear_since: float | None = None
+        """Time of the first of the latest failures that may pass or not."""
         self.is_running = False
         """Whether the run has started and not ended."""
         self._experiment, self._sweep_tags, self._added = experiment, sweep_tags, added

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import math
 import random
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -20,8 +22,8 @@ SAY_SECONDS = 5.0
 """Time between two messages about the records that are left."""
 GATHER_SECONDS = 0.2
 """Wait before each round, so that one request takes several reports."""
-MOST_UNCLEAR = 12
-"""Number of unclear failures in a row after which a run is refused; minutes, with the pauses."""
+UNCLEAR_SECONDS, LONGEST_UNCLEAR_SECONDS = 10.0, 120.0
+"""Time of unclear failures after which a run is refused, if others succeed meanwhile or not."""
 FIRST_PAUSE = 0.5
 LONGEST_PAUSE = 30.0
 
@@ -56,6 +58,8 @@ class Sender(Thread):
         self._change = threading.Condition()
         self._has_news = self._flushing = self._stopped = self._failed = False
         self._failures = 0
+        self._succeeded = -math.inf
+        """Time of the last success."""
         self._error: str | None = None
 
     def add(self, run: RunQueue) -> None:
@@ -175,9 +179,8 @@ class Sender(Thread):
         # The thread must survive every error; unsent records stay in the queue.
         except Exception as error:
             reason = mlflow_reason(error)
-            run.unclear = run.unclear + 1 if is_unclear(error) else 0
-            lasts = is_lasting(error) or run.unclear >= MOST_UNCLEAR
-            if lasts or isinstance(error, DamagedError):
+            lasts = is_lasting(error) or isinstance(error, DamagedError)
+            if lasts or (is_unclear(error) and self._has_lasted(run)):
                 run.refused = reason
                 logger.warning("MLflow at %s does not get all of a run: %s", self._store, reason)
                 return
@@ -190,7 +193,17 @@ class Sender(Thread):
                 self._failed = True
                 self._runs[run] = self._runs.pop(run)
         else:
-            run.unclear = 0
+            run.unclear_since, self._succeeded = None, time.monotonic()
+
+    def _has_lasted(self, run: RunQueue) -> bool:
+        """Whether an unclear failure of the run is a lasting one."""
+        now = time.monotonic()
+        if run.unclear_since is None:
+            run.unclear_since = now
+        elapsed = now - run.unclear_since
+        # Of this run alone, or of the server.
+        least = UNCLEAR_SECONDS if self._succeeded > run.unclear_since else LONGEST_UNCLEAR_SECONDS
+        return elapsed >= least
 
     def _pause(self) -> None:
         longest = FIRST_PAUSE if self._flushing else LONGEST_PAUSE

@@ -201,7 +201,7 @@ def check_reachable(store: TrackingStore) -> None:
             reason = f"it answered with status {answer.status_code}"
     except requests.Timeout:
         reason = f"no answer within {CONNECT_SECONDS + ANSWER_SECONDS:.0f} s"
-    except requests.RequestException as error:
+    except (OSError, ValueError) as error:  # also of a certificate or a variable of MLflow
         reason = f"no connection ({_cause(error)})"
     if reason is not None:
         raise TrackingError(
@@ -221,14 +221,13 @@ def _cause(error: BaseException) -> str:
 def mlflow_version(store: TrackingStore) -> str | None:
     """Version of the MLflow that shows the store; None if a server does not answer."""
     import mlflow
-    import requests
 
     if not store.is_server:
         return mlflow.__version__
     try:
         answer = _get(store, "version")
         return answer.text.strip() if answer.ok else None
-    except requests.RequestException:
+    except (OSError, ValueError):
         return None
 
 

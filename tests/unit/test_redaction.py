@@ -119,12 +119,20 @@ def test_names_of_environments_and_rewards_are_kept() -> None:
     """`resume` reads them; the value of another setting may be a password."""
     kept = {
         "environments": {"T": {"env_id": "token_world:TokenWorld-v0"}},
-        "grid": {"intrinsic.reward": ["cookie_rewards:Count", "rnd"]},
+        "stages": [{"grid": {"intrinsic.reward": ["cookie_rewards:Count", "rnd"]}}],
+        "task": {"env_id": "secretary:Office-v0"},
+        "intrinsic": {"reward": "token_rewards:Mine"},
     }
     assert without_secrets(kept) == kept
-    hidden = {"env_id": "token_world:T-v0 password: hunter2", "note": "token:abcdefgh"}
+    task = {
+        "env_id": "token_world:T-v0 password: hunter2",
+        "env_kwargs": {"reward": "password:hunter2", "environments": [{"password": "hunter2"}]},
+    }
+    token = "ghp_" + 36 * "a"
+    hidden = {"environments": {"T": task}, "note": "token:hunter2", "reward": "token:hunter2"}
+    hidden |= {"intrinsic": {"reward": f"{token}:x"}}
     assert "hunter2" not in str(without_secrets(hidden))
-    assert "abcdefgh" not in str(without_secrets(hidden))
+    assert token not in str(without_secrets(hidden))
 
 
 def test_params_are_flat_text() -> None:

@@ -78,7 +78,9 @@ def slurm(
     of_a_task = [*(overrides or ()), f"resources.num_cpus={cpus}"]
     config = driver.load(file, of_a_task, storage=storage, name=name, seeds=seeds)
     # The tasks log to files of their own, the job after them to this store.
-    resolve_store(config.mlflow.tracking_uri or os.environ.get(driver.VARIABLE), config.storage)
+    is_given = "tracking_uri" in (config.document.get("mlflow") or {})
+    uri = config.mlflow.tracking_uri if is_given else os.environ.get(driver.VARIABLE)
+    resolve_store(uri, config.storage)
     if not _TIME.fullmatch(time):
         raise BadInputError(f"--time must be a time of Slurm such as 12:00:00 or 1-00, got {time}")
     options = {"job-name": config.name, "time": time, "cpus-per-task": cpus, "partition": partition}

@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from gymnasium.envs.classic_control.pendulum import PendulumEnv
 from ray import tune
 from ray.rllib.callbacks.callbacks import RLlibCallback
 from ray.rllib.core.learner.torch.torch_learner import TorchLearner
@@ -631,6 +632,22 @@ def test_a_name_that_is_registered_with_ray_is_the_users_environment() -> None:
         algo.stop()
     finally:
         _global_registry.unregister(ENV_CREATOR, "Pendulum-v1")
+
+
+class OfAClass(PendulumEnv):
+    def __init__(self, config: Any) -> None:
+        super().__init__()
+
+
+def test_a_class_and_a_time_limit_without_a_registration_are_an_environment() -> None:
+    config = TACConfig().environment(OfAClass).training(**SMALL, max_episode_steps=20)
+    algo: TAC = config.reporting(min_sample_timesteps_per_iteration=1).build_algo()
+    assert algo.train()["env_runners"]["episode_len_mean"] == 20
+    algo.stop()
+    tune.register_env("Limited", lambda c: gym.wrappers.TimeLimit(OfAClass(c), 30))
+    algo = build("Limited")
+    assert algo.train()["env_runners"]["episode_len_mean"] == 30
+    algo.stop()
 
 
 def test_delayed_updates_without_rllibs_skipping_of_nans() -> None:

@@ -98,7 +98,9 @@ def test_what_an_environment_does_in_an_episode_is_named(
 
     with monkeypatch.context() as patch:
         patch.setattr(env.unwrapped, "step", unstable)
-        with pytest.raises(PolicyError, match=r"Pendulum.*step 1: simulator unstable"):
+        with pytest.raises(
+            PolicyError, match=r"Pendulum.*step 1: RuntimeError: simulator unstable"
+        ):
             next(play(policy, env, 1, seed=0))
     monkeypatch.setattr(env.unwrapped, "_get_obs", lambda: np.full(3, np.nan, np.float32))
     with pytest.raises(PolicyError, match="finite"):

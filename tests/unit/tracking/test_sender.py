@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 
 import pytest
@@ -12,6 +13,7 @@ from music_rllib.tracking import sender
 from music_rllib.tracking.client import Experiment
 from music_rllib.tracking.run_queue import RunQueue
 from music_rllib.tracking.sender import Sender
+from tests.processes import wait_until
 
 
 class Failing(RunQueue):
@@ -33,6 +35,8 @@ class Failing(RunQueue):
 @pytest.fixture
 def started(monkeypatch: pytest.MonkeyPatch) -> Iterator[Sender]:
     monkeypatch.setattr(sender, "FIRST_PAUSE", 0.001)
+    monkeypatch.setattr(sender, "LONGEST_UNCLEAR_SECONDS", 1.0)
+    monkeypatch.setattr(sender, "UNCLEAR_SECONDS", 0.1)
     monkeypatch.setattr(sender, "GATHER_SECONDS", 0.001)
     thread = Sender("http://mlflow")
     thread.start()
@@ -46,7 +50,7 @@ def started(monkeypatch: pytest.MonkeyPatch) -> Iterator[Sender]:
     [
         (codes.ENDPOINT_NOT_FOUND, 5, True),  # of a proxy whose server starts again
         (codes.BAD_REQUEST, 5, True),  # of a database that has failed over
-        (codes.BAD_REQUEST, 100, False),
+        (codes.BAD_REQUEST, 10**6, False),
         (codes.INTERNAL_ERROR, 50, True),
         (codes.INVALID_PARAMETER_VALUE, 1, False),
     ],
@@ -59,3 +63,15 @@ def test_a_failure_that_may_pass_loses_nothing(
     assert started.flush(10.0) == arrives
     assert bool(run.refused) != arrives
     assert run.attempts <= failures + 1
+
+
+def test_what_a_server_lacks_does_not_delay_other_runs(started: Sender) -> None:
+    run, other = Failing(codes.ENDPOINT_NOT_FOUND, 10**6), Failing(codes.BAD_REQUEST, 0)
+    other.node_key = "b"
+    started.add(run)
+    wait_until(lambda: run.attempts > 2, 10)
+    started.add(other)
+    begin = time.monotonic()
+    wait_until(lambda: run.refused is not None, 10)
+    assert not other.records
+    assert time.monotonic() - begin < 0.8, "others succeed, so the failure is not the server's"
