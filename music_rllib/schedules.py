@@ -155,11 +155,9 @@ class Follower:
         return mean + kept * (float(state["before"]) - mean)
 
     def state(self) -> dict[str, float | None]:
-        """The state for a checkpoint."""
         return dict(self._state)
 
     def load_state(self, state: Mapping[str, float | None]) -> None:
-        """Restore the state of a checkpoint."""
         self._state = dict(state)
 
 

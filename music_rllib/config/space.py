@@ -68,13 +68,8 @@ class _Range(_Dimension):
         value = self.bounds[0] + position * (self.step or 0)
         return value if isinstance(self, IntRange) else float(f"{value:.12g}")
 
-    def ends(self) -> tuple[Any, ...]:
-        """Both ends; if they are valid settings, the range is valid."""
-        return self.reachable
-
-    @property
-    def reachable(self) -> tuple[Any, Any]:
-        """Both ends, the upper one a whole number of steps above the lower one."""
+    def ends(self) -> tuple[Any, Any]:
+        """Both ends, a whole number of steps apart; if they are valid, the range is valid."""
         return self.bounds if self.size is None else (self._at(0), self._at(self.size - 1))
 
     def values(self) -> tuple[Any, ...] | None:
@@ -83,7 +78,7 @@ class _Range(_Dimension):
 
     def contains(self, value: Any) -> bool:
         """Whether `value` is one of the values."""
-        low, high = self.reachable
+        low, high = self.ends()
         number = isinstance(value, int | float) and not isinstance(value, bool)
         if not (number and low <= value <= high):
             return False

@@ -10,7 +10,7 @@ from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from music_rllib.limits import MOST_INDICES
 from music_rllib.schedules import StrictModel
@@ -109,13 +109,11 @@ class Translation(_Entries):
     """Largest distance."""
 
 
-class Symmetries(BaseModel):
+class Symmetries(StrictModel):
     """Changes that turn possible transitions of a task into possible ones with the same reward.
 
     Everything with a place changes together: the agent, its surroundings and the goal.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     mirror: Mirror | None = None
     """The environment is its own mirror image."""

@@ -58,7 +58,6 @@ class PlayedValues:
         return self._lowest < self._highest
 
     def see(self, observation: Any) -> None:
-        """Take in a valid observation."""
         parts, values = {GOAL_KEYS[0]: self._space}, {GOAL_KEYS[0]: observation}
         if isinstance(self._space, spaces.Dict):
             parts, values = self._space.spaces, observation

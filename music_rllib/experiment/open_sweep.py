@@ -104,7 +104,6 @@ class OpenSweep:
         return ShortLabels.of(node.label for node in self.plan.nodes)
 
     def results(self) -> dict[str, RunResult]:
-        """Results of the finished nodes, by key."""
         results = zip(self.finished, self.store.map(self.store.result, self.finished), strict=True)
         return {key: result for key, result in results if result is not None}
 

@@ -24,9 +24,9 @@ value and gradient finite, and the gradient never becomes 0. e^10 = 22,026: at q
 densities above that, at q = 1.5 above 4.9e8.
 """
 
-_HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
-_LOG_2 = math.log(2.0)
-_SHANNON = 1e-9
+HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
+LOG_2 = math.log(2.0)
+SHANNON = 1e-9
 """|q - 1| below which ln is used: the difference is far below float64 resolution."""
 
 
@@ -58,8 +58,8 @@ def sample_squashed(mean: Tensor, log_std: Tensor, noise: Tensor) -> PolicySampl
     digits if tanh saturates (Haarnoja et al. 2018, app. C; absent in paper eq. 11).
     """
     raw = _before_tanh(mean, log_std, noise)
-    log_normal = -0.5 * noise.square() - log_std - _HALF_LOG_2PI
-    log_jacobian = 2.0 * (_LOG_2 - raw - F.softplus(-2.0 * raw))
+    log_normal = -0.5 * noise.square() - log_std - HALF_LOG_2PI
+    log_jacobian = 2.0 * (LOG_2 - raw - F.softplus(-2.0 * raw))
     return PolicySample(torch.tanh(raw), log_normal - log_jacobian)
 
 
@@ -81,7 +81,7 @@ def ln_q_of_log(log_x: Tensor, q: float, *, max_exponent: float = math.inf) -> T
         max_exponent: where (q-1) ln x exceeds this, ln_q continues along its tangent.
     """
     order = q - 1.0
-    if abs(order) < _SHANNON:
+    if abs(order) < SHANNON:
         return log_x
     exponent = order * log_x
     if math.isinf(max_exponent):

@@ -194,7 +194,6 @@ class Music:
         return [self._held_out_sum, self._held_out_steps]
 
     def load_state(self, state: Sequence[float]) -> None:
-        """Continue from a result of `state`."""
         self._held_out_sum, self._held_out_steps = state
 
 

@@ -154,7 +154,6 @@ class RewardLearner:
         self.reward.load_state_dict(tensors)
 
     def state(self) -> dict[str, Any]:
-        """The state for a checkpoint."""
         moments = self._adam.state_dict()["state"] if self._adam is not None else {}
         return {
             "weights": self.weights(),
@@ -167,7 +166,6 @@ class RewardLearner:
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Continue from a result of `state`."""
         self.load_weights(state["weights"])
         self._updates = int(state["updates"])
         self._loss = torch.tensor(state["loss"], device=self.reward.sums.device)

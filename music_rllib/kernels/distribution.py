@@ -13,14 +13,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from music_rllib.functional.distribution import MAX_EXPONENT
+from music_rllib.functional.distribution import HALF_LOG_2PI, LOG_2, MAX_EXPONENT, SHANNON
 from music_rllib.kernels.compiling import compiled
 from music_rllib.kernels.layers import Array
 
-_HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
-_LOG_2 = math.log(2.0)
-_SHANNON = 1e-9
-"""|q - 1| below which ln_q is ln."""
 _SLOPE_BEYOND = math.exp(MAX_EXPONENT)
 
 
@@ -79,8 +75,8 @@ def sample(outputs: Array, noise: Array, distribution: Distribution) -> Sample:
             action[r, a] = math.copysign((1.0 - shrunk) / (1.0 + shrunk), u)
             if stochastic:
                 softplus = math.log1p(shrunk) + max(-2.0 * u, 0.0)
-                log_jacobian = 2.0 * (_LOG_2 - u - softplus)
-                log_density[r, a] = -0.5 * e * e - spread - _HALF_LOG_2PI - log_jacobian
+                log_jacobian = 2.0 * (LOG_2 - u - softplus)
+                log_density[r, a] = -0.5 * e * e - spread - HALF_LOG_2PI - log_jacobian
     return Sample(action, log_density, log_std, std_noise)
 
 
@@ -120,7 +116,7 @@ def sample_backward(
 def _ln_q(log_x: float, q: float) -> tuple[float, float]:
     """ln_q x, with its tangent beyond `MAX_EXPONENT`, and d ln_q x / d ln x = x^(q-1)."""
     order = q - 1.0
-    if abs(order) < _SHANNON:
+    if abs(order) < SHANNON:
         return log_x, 1.0
     exponent = order * log_x
     powered = math.expm1(min(exponent, MAX_EXPONENT))

@@ -64,24 +64,12 @@ class Network(NamedTuple):
 
 
 @compiled
-def linear(inputs: Array, weights: Array, by_outputs: bool, out: Array) -> None:
-    """[R, I] -> [R, O] without the bias."""
-    multiply(inputs, False, weights, by_outputs, out)
-
-
-@compiled
 def linear_backward_weights(inputs: Array, gradient: Array, by_outputs: bool, out: Array) -> None:
     """Gradient of the weights, summed over rows: [R, I], [R, O] -> shape of the weights."""
     if by_outputs:
         multiply(gradient, True, inputs, False, out)
     else:
         multiply(inputs, True, gradient, False, out)
-
-
-@compiled
-def linear_backward_inputs(gradient: Array, weights: Array, by_outputs: bool, out: Array) -> None:
-    """Gradient of the inputs: [R, O] -> [R, I]."""
-    multiply(gradient, False, weights, not by_outputs, out)
 
 
 @compiled
@@ -238,7 +226,7 @@ def forward(network: Network, inputs: Array) -> Array:
         bias = _bias(network, network.values, layer)
         out = layer_outputs(network, layer, rows)
         weights = layer_weights(network, network.values, layer)
-        linear(inputs, weights, network.by_outputs, out)
+        multiply(inputs, False, weights, network.by_outputs, out)
         if layer < last:
             _hidden(out, bias, _of_layer(network, layer, rows))
         else:
@@ -279,7 +267,7 @@ def backward(
         weights = layer_weights(network, network.values, layer)
         size = network.sizes[layer]
         out = scratch[layer % 2, : len(rows) * size].reshape((len(rows), size))
-        linear_backward_inputs(gradient, weights, network.by_outputs, out)
+        multiply(gradient, False, weights, not network.by_outputs, out)
         normalized = _of_layer(network, layer - 1, len(inputs))
         bias = _bias(network, network.gradients, layer - 1)
         _hidden_backward(out, below, normalized, rows, learned, bias)

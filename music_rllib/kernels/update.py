@@ -30,6 +30,7 @@ from music_rllib.kernels.actor_critic import (
     value_loss,
 )
 from music_rllib.kernels.adam import AdamStep, adam_step
+from music_rllib.kernels.blas import multiply
 from music_rllib.kernels.compiling import compiled, kept_on_disk, sources_of
 from music_rllib.kernels.distribution import (
     Distribution,
@@ -45,7 +46,6 @@ from music_rllib.kernels.layers import (
     forward,
     layer_outputs,
     layer_weights,
-    linear_backward_inputs,
     member,
 )
 
@@ -255,7 +255,7 @@ def _critics_backward(
         if end == count:
             continue
         weights = layer_weights(critic, critic.values, 0)[inputs:]
-        linear_backward_inputs(of_hidden[count:], weights, False, part[: end - count])
+        multiply(of_hidden[count:], False, weights, True, part[: end - count])
         for r in range(count, end):
             for a in range(size):
                 of_action[rows[r] - count, a] += part[r - count, a]
@@ -276,7 +276,6 @@ def _policy_backward(
 
 @compiled
 def _minibatch(batch: Batch, k: int, rows: int) -> Batch:
-    """The minibatch of update k."""
     cut = slice(k * rows, (k + 1) * rows)
     size = len(batch.target_critics) * rows // len(batch.actions)
     return Batch(

@@ -52,7 +52,6 @@ class TrajectoryRing:
 
     @property
     def trajectories(self) -> int:
-        """Trajectories held."""
         return len(self._lengths)
 
     @property

@@ -106,7 +106,6 @@ class SumTree:
 
     @property
     def total(self) -> float:
-        """Sum of all weights."""
         return float(self._tree[1])
 
     def __getitem__(self, indices: Rows) -> Weights:

@@ -18,7 +18,6 @@ from dataclasses import replace
 from itertools import chain
 from multiprocessing import get_context
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -37,7 +36,6 @@ from music_rllib.report.figures.choice import (
     study_drawings,
 )
 from music_rllib.report.figures.draw import files
-from music_rllib.report.figures.plots import Legend, Subplot
 from music_rllib.report.page import SweepReport, render, runs_table
 from music_rllib.report.two_sweeps import difference_tables, titles_of
 from music_rllib.report.videos import Videos, make_videos
@@ -141,7 +139,6 @@ def _without_chance(drawings: Iterator[Drawing], stages: Sequence[StageRuns]) ->
 
 
 def _with_own_names(drawings: Iterator[Drawing]) -> Iterator[Drawing]:
-    """The drawings, each with a file name of its own."""
     seen: Counter[str] = Counter()
     for drawing in drawings:
         seen[drawing.name] += 1
@@ -249,16 +246,8 @@ def _listed(labels: Sequence[str]) -> str:
 # Files ------------------------------------------------------------------------------------------
 
 
-class Figure(NamedTuple):
-    """A figure in files of its own."""
-
-    name: str
-    subplots: Sequence[Subplot]
-    legend: Legend
-
-
 @contextlib.contextmanager
-def _drawn(figures: Sequence[Figure]) -> Iterator[Iterator[Mapping[str, bytes]]]:
+def _drawn(figures: Sequence[Drawing]) -> Iterator[Iterator[Mapping[str, bytes]]]:
     """The files of each figure, drawn by a process for each core if it is safe to fork."""
     cores = len(os.sched_getaffinity(0))
     if cores == 1 or len(figures) < 2 or threading.active_count() > 1:
@@ -277,12 +266,12 @@ def _drawn(figures: Sequence[Figure]) -> Iterator[Iterator[Mapping[str, bytes]]]
         yield drawn
 
 
-_INHERITED: list[Figure] = []
+_INHERITED: list[Drawing] = []
 _SET_DEATH_SIGNAL = 1
 """PR_SET_PDEATHSIG of Linux."""
 
 
-def _inherit(figures: Sequence[Figure], parent: int) -> None:
+def _inherit(figures: Sequence[Drawing], parent: int) -> None:
     """Keep the figures in a drawing process, which ends with its parent."""
     ctypes.CDLL(None).prctl(_SET_DEATH_SIGNAL, signal.SIGTERM)
     if os.getppid() != parent:  # it has ended already
@@ -294,7 +283,7 @@ def _draw_inherited(number: int) -> Mapping[str, bytes]:
     return _draw(_INHERITED[number])
 
 
-def _draw(figure: Figure) -> Mapping[str, bytes]:
+def _draw(figure: Drawing) -> Mapping[str, bytes]:
     return files(figure.subplots, figure.legend)
 
 
@@ -343,8 +332,8 @@ def made_files(folder: Path) -> list[str]:
 def _files_of(report: SweepReport) -> Iterator[tuple[str, bytes]]:
     """Paths, below the report's folder, and contents of its files."""
     shown, legend = overview(report.sweep, [analysis.stage for analysis in report.analyses])
-    figures = [Figure(PICTURE, shown, legend)] if shown else []
-    figures += [Figure(one.name, one.subplots, one.legend) for one in report.drawings]
+    first = Drawing(stage="", title=PICTURE, caption="", subplots=shown, legend=legend)
+    figures = [*[first] * bool(shown), *report.drawings]
     with _drawn(figures) as contents:
         yield PAGE, render(report).encode()  # while other processes draw
         for figure, content in zip(figures, contents, strict=True):

@@ -139,7 +139,6 @@ def _primary(title: str, drawings: Sequence[Drawing]) -> str:
 def _curves(
     sweep: Sweep, drawing: Drawing, drawings: Sequence[Drawing], known: KnownAxes
 ) -> list[Mapping[str, Any]]:
-    """The curves of one of a stage's `drawings`."""
     titles, conditions = _subplots(drawings), list(_facets(drawing).styles)
     return [
         {

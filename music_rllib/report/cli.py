@@ -242,7 +242,6 @@ def _report(
 
 
 def _command() -> str:
-    """This command without secrets."""
     from music_rllib.redaction import redact
 
     return redact(shlex.join([*called_as(), *sys.argv[1:]]))

@@ -18,7 +18,7 @@ from datetime import UTC, datetime
 from typing import Annotated, Any, Literal, Self
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, model_validator
+from pydantic import Field, TypeAdapter, model_validator
 
 from music_rllib import names
 from music_rllib.config.schema import Hypothesis, Stage, SweepConfig
@@ -26,6 +26,7 @@ from music_rllib.config.tac_settings import setting_text
 from music_rllib.errors import reason_of
 from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.sweep_files import ANALYSIS_PLAN, SweepLocation, as_json
+from music_rllib.schedules import StrictModel
 from music_rllib.store.serialization import content_key
 from music_rllib.store.storage import StorageError
 
@@ -50,11 +51,7 @@ Line = Annotated[str, Field(max_length=100_000, pattern=r"^[^\x00-\x1f\x7f]*$")]
 """Plans may come from strangers: text without control characters, which a terminal would obey."""
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
-
-
-class AnalysisPlan(_Strict):
+class AnalysisPlan(StrictModel, strict=True):
     """A question, and everything needed to decide it."""
 
     question: Line | None
@@ -118,7 +115,7 @@ def _stages_of(hypotheses: Sequence[str], default: str) -> frozenset[str]:
     return frozenset(side.get("stage", default) for side in sides)
 
 
-class PlanVersion(_Strict):
+class PlanVersion(StrictModel, strict=True):
     """A recorded version of a plan."""
 
     version: int = Field(ge=1)

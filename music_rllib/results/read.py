@@ -148,7 +148,6 @@ _NOT_STARTED: dict[str, Any] = {
 
 
 def _status(state: Mapping[str, Any]) -> str:
-    """The status of the whole sweep."""
     if sweep_files.is_alive(state):
         return "RUNNING"
     ended = {"finished": "FINISHED", "failed": "FAILED", "waiting": "SCHEDULED"}

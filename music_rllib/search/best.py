@@ -20,7 +20,7 @@ from music_rllib.names import in_runs, symbol
 from music_rllib.results.analysis import FinalScores, stage_scopes
 from music_rllib.results.conditions import ALL_TASKS, Condition, find_stages
 from music_rllib.results.data import Sweep
-from music_rllib.results.statistics import Estimate, with_interval
+from music_rllib.results.statistics import with_interval
 from music_rllib.search.objective import interval
 
 
@@ -90,7 +90,7 @@ def best_so_far(
             best = _best_trial(stage, stage.search, by_stage.get(stage.name))
         if best is not None:
             entropies = {
-                metric: {"value": final.value, "interval": _ends(final.estimate)}
+                metric: {"value": final.value, "interval": [*final.estimate.numbers[1:]]}
                 for metric in names.ENTROPIES
                 if (final := condition_of(best, stage, plan, sweep, metric)) is not None
             }
@@ -140,15 +140,11 @@ def _best_row(
         "direction": "maximize",
         "value": best.value,
         "level": sum(math.isclose(final.value, best.value) for final in ranked) - 1,
-        "interval": _ends(best.estimate),
+        "interval": [*best.estimate.numbers[1:]],
         "runs": best.runs,
         "planned": planned(best),
         "on_fresh_seeds": False,
     }
-
-
-def _ends(estimate: Estimate) -> list[float]:
-    return [float(estimate.lower), float(estimate.upper)]
 
 
 def _best_trial(
@@ -183,7 +179,7 @@ def _best_trial(
         "direction": direction,
         "value": value,
         "level": sum(math.isclose(other, value) for other in values) - 1,
-        "interval": _ends(estimate),
+        "interval": [*estimate.numbers[1:]],
         "runs": scores.size,
         "planned": scores.size,
         "on_fresh_seeds": bool(ranking),

@@ -97,7 +97,7 @@ def _intervals(search: Search, scores: Sequence[Any]) -> list[list[float]]:
         interval(objective, np.asarray(of_objective), search.stage.evaluation_episodes)
         for objective, of_objective in zip(search.settings.objectives, scores, strict=True)
     ]
-    return [[float(estimate.lower), float(estimate.upper)] for estimate in estimates]
+    return [[*estimate.numbers[1:]] for estimate in estimates]
 
 
 def _importance(study: OptunaStudy) -> dict[str, float]:

@@ -201,10 +201,10 @@ def trial_at(
 def _distribution(dimension: Dimension) -> BaseDistribution:
     match dimension:
         case FloatRange():
-            low, high = dimension.reachable
+            low, high = dimension.ends()
             return FloatDistribution(low, high, log=dimension.log, step=dimension.step)
         case IntRange():
-            low, high = dimension.reachable
+            low, high = dimension.ends()
             return IntDistribution(low, high, log=dimension.log, step=dimension.step)
         case Choice():
             return CategoricalDistribution([_plain(value) for value in dimension.choice])
@@ -213,12 +213,12 @@ def _distribution(dimension: Dimension) -> BaseDistribution:
 def _suggest(trial: optuna.Trial, name: str, dimension: Dimension) -> Any:
     match dimension:
         case FloatRange():
-            low, high = dimension.reachable
+            low, high = dimension.ends()
             value = trial.suggest_float(name, low, high, log=dimension.log, step=dimension.step)
             digits = DIGITS if dimension.step is None else 12
             return min(max(float(f"{value:.{digits}g}"), low), high)
         case IntRange():
-            low, high = dimension.reachable
+            low, high = dimension.ends()
             return trial.suggest_int(name, low, high, log=dimension.log, step=dimension.step)
         case Choice():
             chosen = trial.suggest_categorical(name, [_plain(value) for value in dimension.choice])

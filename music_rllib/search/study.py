@@ -151,7 +151,6 @@ class OptunaStudy:
         return {**self.compared, **trial.user_attrs[VALUES]}
 
     def complete(self) -> list[FrozenTrial]:
-        """Complete trials in their order."""
         return [trial for trial in self.trials() if trial.state is TrialState.COMPLETE]
 
     def ranked(self) -> list[FrozenTrial]:

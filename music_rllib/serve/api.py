@@ -63,7 +63,6 @@ class PolicyFacts(BaseModel):
 
     @classmethod
     def of(cls, task: str, policy: Policy | PolicyNetwork) -> PolicyFacts:
-        """The facts about `policy`."""
         return cls(
             task=task,
             observation_size=policy.observation_size,

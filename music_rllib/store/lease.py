@@ -196,7 +196,6 @@ class LeaseFile:
         return self._if_owned_by(lease.owner, partial(self._write, lease))
 
     def is_owned_by(self, owner: str) -> bool:
-        """Whether the file has a lease of this owner."""
         holder = self.read()
         return holder is not None and holder.owner == owner
 

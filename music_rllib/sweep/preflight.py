@@ -43,10 +43,6 @@ _TIMEOUT = "Timeout ("
 _HUMAN = "env_kwargs: {render_mode: human} needs a display; leave it out for training"
 
 
-class TaskError(BadInputError, ValueError):
-    """A task whose environment can't be made, or is not as the task describes it."""
-
-
 def check_environments(plan: Plan, hang_minutes: float | None = None) -> list[str]:
     """Play each declared environment in a child process, and check that its task describes it.
 
@@ -54,7 +50,7 @@ def check_environments(plan: Plan, hang_minutes: float | None = None) -> list[st
     each.
 
     Raises:
-        TaskError: A task does not fit; with one line per problem, and the remarks.
+        BadInputError: A task does not fit; with one line per problem, and the remarks.
     """
     runs = [run for run in plan.settings if run.task.name not in BUILT_IN_TASKS]
     if not runs:
@@ -79,7 +75,7 @@ def check_environments(plan: Plan, hang_minutes: float | None = None) -> list[st
             problems += [f"environments.{name}: {line}" for line in wrong]
             remarks += [f"environments.{name}: {line}" for line in noteworthy]
     if problems:
-        raise TaskError("\n".join((*problems, *(f"also: {line}" for line in remarks))))
+        raise BadInputError("\n".join((*problems, *(f"also: {line}" for line in remarks))))
     return remarks
 
 
@@ -87,8 +83,8 @@ def fingerprints(plan: Plan) -> dict[str, Fingerprint]:
     """The fingerprint of each task's environment, by `RunSettings.code`; imports users' modules.
 
     Raises:
-        TaskError: The module of an environment or of an intrinsic reward can't be imported, or the
-            reward's class or settings do not fit.
+        BadInputError: The module of an environment or of an intrinsic reward can't be imported, or
+            the reward's class or settings do not fit.
     """
     found = {}
     for code, run in {run.code: run for run in plan.settings}.items():
@@ -97,7 +93,7 @@ def fingerprints(plan: Plan) -> dict[str, Fingerprint]:
         except Exception as error:  # a user's module may raise anything
             own = f" and intrinsic.reward {run.intrinsic.reward}" if run.own_modules else ""
             place = f"environments.{run.task.name}{own}"
-            raise TaskError(f"{place} must be importable: {error}") from error
+            raise BadInputError(f"{place} must be importable: {error}") from error
     own_rewards = {
         run.intrinsic.identity: run.intrinsic for run in plan.settings if run.own_modules
     }
@@ -107,7 +103,7 @@ def fingerprints(plan: Plan) -> dict[str, Fingerprint]:
         try:
             checked_class(settings)
         except ValueError as error:
-            raise TaskError(str(error)) from error
+            raise BadInputError(str(error)) from error
     return found
 
 
@@ -228,17 +224,13 @@ def find_cluster(
     return capacity
 
 
-class DemandError(BadInputError, ValueError):
-    """A run does not fit on any available machine."""
-
-
 def check_demand(sweep: OpenSweep, node_memory: float | None = None) -> None:
     """Check that each unfinished run fits into the memory of this machine, or of a cluster's nodes.
 
     `node_memory` is that of the largest node in bytes.
 
     Raises:
-        DemandError: A run does not fit.
+        BadInputError: A run does not fit.
     """
     runs = [(node.stage, node.run) for node in sweep.plan.nodes if node.key not in sweep.finished]
     for stage in sweep.plan.searched:
@@ -253,13 +245,13 @@ def check_memory(runs: Iterable[tuple[str, RunSettings]], place: str, memory: fl
     """Check that each of `runs`, given with the names of their stages, fits into `memory` bytes.
 
     Raises:
-        DemandError: A run does not fit; the message names the setting that needs most.
+        BadInputError: A run does not fit; the message names the setting that needs most.
     """
     for stage, run in runs:
         needed = _least_memory(run)
         setting = max(needed, key=lambda name: needed[name])
         if sum(needed.values()) > memory:
-            raise DemandError(
+            raise BadInputError(
                 f"stage {stage}: {setting} must fit into the memory of {place}, "
                 f"{memory / 2**30:.1f} GiB, got {shown(attrgetter(setting)(run))}, for which a run "
                 f"on {run.task.name} needs at least {needed[setting] / 2**30:.3g} GiB"

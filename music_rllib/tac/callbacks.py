@@ -93,7 +93,6 @@ class EpisodeCallbacks:
             self._finished.append(self._episodes[index].to_numpy())
 
     def sample_ended(self) -> None:
-        """Call at the end of `sample`."""
         if self._is_on:
             self._call("on_sample_end", samples=self._finished)
             self._finished = []

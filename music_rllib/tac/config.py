@@ -233,13 +233,7 @@ class TACConfigBase(AlgorithmConfig):
     def settings(self) -> AlgorithmSettings:
         """The validated settings; raises ValueError that names each problem."""
         if self._settings is None:
-            found = AlgorithmSettings(
-                tac=self._validated(TACSettings, ""),
-                music=self._validated(MusicSettings, "music_"),
-                replay=self._validated(ReplaySettings, "replay_"),
-                split=self._validated(Split, ""),
-                intrinsic=self._validated(IntrinsicSettings, "intrinsic_"),
-            )
+            found = AlgorithmSettings._make(self._validated(*part) for part in _MODELS)
             self.__dict__["_settings"] = found  # also if the config is frozen
             return found
         return self._settings

@@ -97,7 +97,6 @@ class ScheduledSettings:
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Continue from a result of `state`."""
         self._set(state["env_steps"], dict(state["followed"]))
         for name, follower in self._followers.items():
             if name in state["followers"]:  # else the setting did not follow anything

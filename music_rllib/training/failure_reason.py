@@ -65,7 +65,6 @@ def in_words_only() -> Iterator[None]:
 
 
 def _memory() -> str:
-    """Memory of this process and its machine."""
     memory, own = psutil.virtual_memory(), psutil.Process().memory_info().rss
     return (
         f"The process had {own / 2**30:.1f} GiB, {memory.available / 2**30:.1f} of the machine's "

@@ -72,7 +72,6 @@ class HangWatch:
         self._process.stdin.flush()
 
     def end(self) -> None:
-        """End the watching process."""
         import faulthandler
 
         assert self._process.stdin is not None

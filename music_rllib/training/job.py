@@ -62,7 +62,6 @@ class NodeJob(BaseModel):
 
     @classmethod
     def from_tune(cls, config: dict[str, Any]) -> NodeJob:
-        """Inverse of `to_tune`."""
         return cls.model_validate_json(config["job"])
 
 
@@ -81,7 +80,6 @@ class StopFlag:
         internal_kv._internal_kv_put(self.key, "stop", namespace=_NAMESPACE)
 
     def clear(self) -> None:
-        """Remove the flag from a cluster."""
         internal_kv._internal_kv_del(self.key, namespace=_NAMESPACE)
 
 
@@ -100,7 +98,6 @@ class StopWatch:
         return self._asked.is_set()
 
     def end(self) -> None:
-        """Stop polling."""
         self._ended.set()
 
     def _look(self) -> None:

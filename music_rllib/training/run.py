@@ -126,7 +126,6 @@ class TrainingRun:
 
     @property
     def env_steps(self) -> int:
-        """Environment steps done."""
         return self.algorithm.env_steps
 
     @property
@@ -186,7 +185,6 @@ class TrainingRun:
         }
 
     def network_weights(self) -> dict[str, dict[str, NDArray[Any]]]:
-        """Weights of every network, by its name."""
         return self.algorithm.get_network_weights()
 
     @property

@@ -67,7 +67,6 @@ class RunStorage:
 
     @cached_property
     def work(self) -> WorkFolder:
-        """The run's checkpoints."""
         return self.store.work_folder(self._job.key, self._job.checkpoints.keep)
 
     @property

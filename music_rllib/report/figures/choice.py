@@ -155,7 +155,6 @@ class Facets:
         return cls(setting, {condition: styles[rest[condition]] for condition in rest})
 
     def title(self, task: str, condition: Condition) -> str:
-        """The title of a condition's subplot."""
         value = dict(condition.others).get(self.setting)
         return f"{task}, {self.setting} = {value}" if self.setting else task
 
@@ -187,7 +186,6 @@ def facet_of(conditions: Sequence[Condition]) -> str:
 
 
 def _curves(sweep: Sweep, stage: StageRuns, metrics: Sequence[Metric]) -> Iterator[Drawing]:
-    """The learning curves of a stage, of each metric that it has."""
     facets = Facets.of(stage)
     labels = {facets.label(condition): style for condition, style in facets.styles.items()}
     for metric in metrics:

@@ -5,8 +5,9 @@ from typing import Any
 
 import pytest
 
+from music_rllib.errors import BadInputError
 from music_rllib.experiment.plan import make_plan
-from music_rllib.sweep.preflight import TaskError, check_environments
+from music_rllib.sweep.preflight import check_environments
 from tests.integration.conftest import ENVIRONMENTS
 from tests.sweep_files import loaded
 
@@ -58,7 +59,7 @@ MISFITS: list[tuple[dict[str, Any], str]] = [
 
 def test_tasks_that_do_not_fit_are_named(tmp_path: Path) -> None:
     fits = PUSH | {"horizon": 80, "env_kwargs": {"max_episode_steps": 80}}
-    with pytest.raises(TaskError) as caught:
+    with pytest.raises(BadInputError) as caught:
         check(tmp_path, *(task for task, _ in MISFITS), fits, hindsight_k=4.0)
     lines = str(caught.value).splitlines()
     for i, (line, (_, rule)) in enumerate(zip(lines, MISFITS, strict=True)):
@@ -68,7 +69,7 @@ def test_tasks_that_do_not_fit_are_named(tmp_path: Path) -> None:
 def test_dense_rewards_need_a_distance_for_hindsight_from_moved_episodes(tmp_path: Path) -> None:
     maze = {"env_id": "PointMaze_UMazeDense-v3", "horizon": 100, "success_key": "success"}
     moved: dict[str, Any] = {"hindsight_k": 4.0, "hindsight_episodes": "moved"}
-    with pytest.raises(TaskError) as caught:
+    with pytest.raises(BadInputError) as caught:
         check(tmp_path, maze, maze | {"moved_distance": 0.1}, **moved)
     (line,) = str(caught.value).splitlines()
     assert line.startswith("environments.T0: ")
@@ -77,7 +78,7 @@ def test_dense_rewards_need_a_distance_for_hindsight_from_moved_episodes(tmp_pat
 
 def test_all_problems_are_reported_at_once(tmp_path: Path) -> None:
     task = {"env_id": "Pendulum-v1", "horizon": 300, "agent_indices": [0]}
-    with pytest.raises(TaskError) as caught:
+    with pytest.raises(BadInputError) as caught:
         check(tmp_path, task | {"surrounding_indices": [5]}, hindsight_k=4.0)
     lines = str(caught.value).splitlines()
     rules = ["surrounding_indices", "horizon", "must", "environments.T0:"]
@@ -137,7 +138,7 @@ def test_an_environment_that_ends_its_process_is_named_and_the_others_are_played
     def lines(*names: str) -> list[str]:
         return check(tmp_path, *({"env_id": f"fatal_env:{n}-v0", "horizon": 20} for n in names))
 
-    with pytest.raises(TaskError) as caught:
+    with pytest.raises(BadInputError) as caught:
         lines("Loud", "Aborts", "Ends", "Stops", "Raises")
     aborted, ended, stopped, _ = str(caught.value).splitlines()
     assert (

@@ -8,12 +8,9 @@ from typing import Any
 import pytest
 
 from music_rllib.config.run_settings import RunSettings
+from music_rllib.errors import BadInputError
 from music_rllib.runtime.ray_cluster import Capacity
-from music_rllib.sweep.preflight import (
-    DemandError,
-    check_demand,
-    check_memory,
-)
+from music_rllib.sweep.preflight import check_demand, check_memory
 from tests.sweep_files import loaded
 
 GIB = 2**30
@@ -46,7 +43,9 @@ def test_a_run_that_does_not_fit_into_memory_is_refused(
     tmp_path: Any, defaults: dict[str, Any], setting: str
 ) -> None:
     asked = run(tmp_path, **defaults)
-    with pytest.raises(DemandError, match=f"^stage a: {setting} must fit into .* got ") as refused:
+    with pytest.raises(
+        BadInputError, match=f"^stage a: {setting} must fit into .* got "
+    ) as refused:
         check_memory([("a", asked)], "this machine", 8 * GIB)
     assert len(str(refused.value)) < 500
 
@@ -71,6 +70,6 @@ def test_the_largest_node_of_a_cluster_must_hold_a_run(tmp_path: Any) -> None:
     node = SimpleNamespace(stage="a", key="k", run=asked)
     plan = SimpleNamespace(nodes=[node], searched=())
     sweep: Any = SimpleNamespace(plan=plan, finished=set())
-    with pytest.raises(DemandError, match=r"of the cluster's largest node, 4\.0 GiB, got"):
+    with pytest.raises(BadInputError, match=r"of the cluster's largest node, 4\.0 GiB, got"):
         check_demand(sweep, Capacity(now=1, memory=4 * GIB).node_memory)
     check_demand(sweep, Capacity(now=0, grows=True, memory=4 * GIB).node_memory)
