@@ -146,19 +146,19 @@ class RunQueue:
             self._remove(records)
 
     def attach(
-        self, started: int | None = None, tags: Mapping[str, str] = {}, *, anew: bool = False
+        self, started: int | None = None, tags: Mapping[str, str] = {}, *, retrained: bool = False
     ) -> KnownRun:
         """The run in MLflow, which is found there or created.
 
         Args:
             started: Start time of a run that is created, in ms since the epoch; by default now.
             tags: Further tags of a run that is created.
-            anew: Whether to replace a complete run, because its node is trained again.
+            retrained: Whether to replace a complete run, because its node is trained again.
         """
         if self._run is None:
             again = started is None  # another driver may have begun the run meanwhile
             run = self._experiment.find(self.node_key, self._identity, again=again)
-            if run is not None and anew and run.is_complete:
+            if run is not None and retrained and run.is_complete:
                 self._experiment.delete(self.node_key)
                 run = None
             if run is None:
@@ -185,7 +185,7 @@ class RunQueue:
                     self._records.popleft()
 
     def _send_start(self) -> None:
-        self.attach(anew=bool(self.node_key))
+        self.attach(retrained=bool(self.node_key))
         params, tags = self._begin()
         self._experiment.log(self.attach().run_id, params=params, tags=tags)
         self._is_new, self._has_begun = False, True
