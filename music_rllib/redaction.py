@@ -161,20 +161,23 @@ def _names_a_class(path: tuple[str, ...]) -> bool:
     """Whether a setting is an environment's id or an intrinsic reward."""
     if "env_kwargs" in path:
         return False
-    of_reward = "intrinsic.reward" in path or path[-2:] == ("intrinsic", "reward")
+    keys = [key.rpartition(":")[2] for key in path if key]  # without the positions in lists
+    of_reward = "intrinsic.reward" in keys or keys[-2:] == ["intrinsic", "reward"]
     return of_reward or (path[-1] == "env_id" and path[0] in ("environments", "task"))
 
 
 def flat_params(settings: Mapping[str, object]) -> dict[str, str]:
     """Nested ``settings`` as MLflow params: dotted names, scalars as text.
 
-    A list is one param (JSON text). Secrets, lists of records and values above
-    ``MAX_PARAM_LENGTH`` characters are omitted: the whole configuration is an artifact anyway.
+    A list is one param (JSON text). Secrets, lists of records outside of the settings of an
+    intrinsic reward, and values above ``MAX_PARAM_LENGTH`` characters are omitted: the whole
+    configuration is an artifact anyway.
     """
     flat = {}
     for name, value in _leaves(without_secrets(settings), ""):
         if isinstance(value, list):
-            if any(isinstance(item, Mapping) for item in value):
+            own = name.startswith("intrinsic.settings.")  # a grid can vary them
+            if any(isinstance(item, Mapping) for item in value) and not own:
                 continue
             value = json.dumps(value, default=str)
         if len(text := str(value)) <= MAX_PARAM_LENGTH:

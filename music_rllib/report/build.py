@@ -224,14 +224,14 @@ def _has_diverged(sweep: Sweep, run: int) -> bool:
     params = sweep.runs[run].params
     steps, means = sweep.series(run, names.Q_MEAN)
     try:
-        low, high = map(float, params["task.reward_range"].strip("[]").split(","))
         gamma = float(params["tac.gamma"])
+        low = high = 0.0
+        if params.get("music.task_reward") != "False":
+            low, high = map(float, params["task.reward_range"].strip("[]").split(","))
     except (KeyError, ValueError):
         return False  # the reachable return is unknown
     if not gamma < 1:
         return False
-    if params.get("music.task_reward") == "False":
-        low = high = 0.0
     weights = (names.MI_REWARD_WEIGHT, names.INTRINSIC_WEIGHT)
     weight = sum(at_steps(name).max(initial=0.0) for name in weights)
     bonuses = at_steps(names.ALPHA) * at_steps(names.ENTROPY)

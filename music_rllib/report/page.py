@@ -88,13 +88,9 @@ class SweepReport:
             return answer(self.sweep, self.study)
         found: list[str] = []
         for sweep, (title, study) in zip(self.both, self.studies.items(), strict=True):
-            verdicts = takewhile(_is_no_detail, answer(sweep, study))
+            verdicts = takewhile(lambda line: not line.startswith("Metric: "), answer(sweep, study))
             found += [f"{title}{line}" for line in verdicts]
         return found
-
-
-def _is_no_detail(sentence: str) -> bool:
-    return not sentence.startswith("Metric: ")
 
 
 _PAGES = Environment(

@@ -102,7 +102,7 @@ def _median_runs(
             ]
             if rated:
                 _, median = sorted(rated)[len(rated) // 2]
-                yield q, sweep.runs[median]
+                yield sweep.runs[median].entropic_index, sweep.runs[median]
 
 
 def _record(storage: str, run: RunRecord, q: str, environments: Sequence[Task]) -> Video:

@@ -233,6 +233,13 @@ def _control(stage: Stage) -> str:
     if len(words) > 1 and len(dict(pairs)) == len(pairs):
         own = ", ".join(f"{alpha} at q = {q}" for q, alpha in sorted(pairs))
         return f"α of its own for each q: {own}"
+    of_tasks: dict[str, set[str]] = {}
+    for point in stage.points:
+        for task, run in point.runs.items():
+            of_tasks.setdefault(task, set()).add(setting_text(run.tac.alpha))
+    if len(words) > 1 and all(len(own) == 1 for own in of_tasks.values()):
+        texts = ", ".join(f"{min(own)} on {task}" for task, own in of_tasks.items())
+        return f"α of its own for each task: {texts}"
     if len(words) > 1:
         return f"α varied: {', '.join(words)}; differences are means over it"
     return f"α {words[0]}" if is_controlled(words[0]) else f"none: one α of {words[0]} for all"

@@ -76,6 +76,8 @@ def _without_result(sweep: Sweep, study: Study) -> str | None:
     if study.stage is None and any(run.status != "SCHEDULED" for run in sweep.runs):
         return "No stage trains for the task: no comparison."
     if study.runs and all(sweep.runs[run].status in ("FINISHED", "FAILED") for run in study.runs):
+        if not all(has_failed(sweep, run) for run in study.runs):
+            return "No finished run has reported the metric."
         return f"No run has a result: {len(study.runs)} failed or diverged."
     if study.stage is not None and study.stage.is_search:
         why = "trials are not compared on the seeds that select them"
@@ -233,14 +235,20 @@ def _control(sweep: Sweep, study: Study) -> str:
     version, stage = study.plan or study.latest, study.stage
     if version is not None or stage is None:
         return version.plan.control if version else "none"
-    alphas = {
-        (one.entropic_index, sweep.runs[one.runs[0]].tags.get(names.TAG_ALPHA, ""))
-        for one in stage.compared
-    }
+    of_tasks: dict[str, set[tuple[str, str]]] = {}
+    for one in stage.compared:
+        for record in (sweep.runs[run] for run in one.runs):
+            pair = (one.entropic_index, record.tags.get(names.TAG_ALPHA, ""))
+            of_tasks.setdefault(record.task, set()).add(pair)
+    alphas = set[tuple[str, str]]().union(*of_tasks.values())
     words = sorted({alpha for _, alpha in alphas})
     if stage.is_search:
         return f"settings were searched on other seeds; α is {', '.join(words)}"
     indices = len({q for q, _ in alphas})
+    of_each = {task: sorted({alpha for _, alpha in pairs}) for task, pairs in of_tasks.items()}
+    if len(words) > 1 and all(len(own) == 1 for own in of_each.values()):
+        texts = ", ".join(f"{own[0]} on {task}" for task, own in of_each.items())
+        return f"α of its own for each task: {texts}"
     if len(words) > 1:
         with_q = " with q" if len(alphas) == indices else ""
         return f"α varies{with_q} ({', '.join(words)})"

@@ -24,6 +24,8 @@ ALL_TASKS = "all tasks"
 AVERAGED = {*names.EVAL_RATES, *names.ENTROPIES}
 """Metrics with the same unit on every task, which can be averaged over tasks."""
 SIDE_BY_SIDE = "stages side by side"
+OF_TASK = "q of each task"
+"""Label of the only condition of a stage whose tasks have different q."""
 SEEDS, FRESH, SEARCHED = "seeds", "fresh", "search"
 """Setting of a search's conditions, and its values: fresh seeds, and the seeds of the trials."""
 IN_WORDS = {
@@ -32,6 +34,8 @@ IN_WORDS = {
     "music.mi_reward_weight": ("MI weight", names.TAG_MI_REWARD_WEIGHT),
 }
 """Settings that can be schedules and then span several params: label, and tag with the words."""
+_OWN_SETTINGS = "intrinsic.settings."
+"""Beginning of the settings of an intrinsic reward. A run has only those that are given."""
 
 
 @lru_cache(maxsize=1024)  # otherwise a third of the time of `find_stages`
@@ -59,7 +63,7 @@ class Condition:
     def label(self) -> str:
         """`q = 1.5, α = 0.1`."""
         pairs = ((ENTROPIC_INDEX, self.entropic_index), *self.others)
-        return ", ".join(f"{name} = {value}" for name, value in pairs if value)
+        return ", ".join(f"{name} = {value}" for name, value in pairs if value) or OF_TASK
 
     @property
     def short_label(self) -> str:
@@ -152,12 +156,16 @@ def find_stages(sweep: Sweep) -> list[StageRuns]:
 def _stage(
     records: Sequence[RunRecord], name: str, runs: Sequence[int], values: Mapping[int, Values]
 ) -> StageRuns:
-    groups: defaultdict[tuple[str, Values], list[int]] = defaultdict(list)
+    groups: defaultdict[Values, list[int]] = defaultdict(list)
     for run in runs:
-        others = dict(values[run])
-        q = others.pop(ENTROPIC_INDEX, records[run].entropic_index)
-        groups[q, tuple(others.items())].append(run)
-    ordered = sorted(groups.items(), key=lambda item: _order(*item[0]))
+        groups[values[run]].append(run)
+    found: list[tuple[tuple[str, Values], list[int]]] = []
+    for settings, members in groups.items():
+        others = dict(settings)
+        of_tasks = {records[run].entropic_index for run in members}  # each task can have its own
+        q = others.pop(ENTROPIC_INDEX, of_tasks.pop() if len(of_tasks) == 1 else "")
+        found.append(((q, tuple(others.items())), members))
+    ordered = sorted(found, key=lambda item: _order(*item[0]))
     return StageRuns(
         name=name,
         variant=records[runs[0]].variant,
@@ -193,6 +201,12 @@ def _varying(runs: Sequence[tuple[str, Mapping[str, str]]]) -> list[str]:
     for seen in forms.values():
         if not frozenset.intersection(*seen):
             varying |= frozenset.union(*seen)
+    alike: defaultdict[tuple[str, str | None], list[frozenset[str]]] = defaultdict(list)
+    for task, settings in runs:  # the default of a reward's setting has no value here
+        of_run = frozenset(name for name in settings if name.startswith(_OWN_SETTINGS))
+        alike[task, settings.get("intrinsic.reward")].append(of_run)
+    for given in alike.values():
+        varying |= frozenset.union(*given) - frozenset.intersection(*given)
     return sorted(varying)
 
 

@@ -100,6 +100,16 @@ def joined(parts: Iterable[Column]) -> Column:
     return Column(*map(np.concatenate, zip(_NO_VALUES, *parts, strict=True)))
 
 
+class _Tag:
+    """A tag of a run as its attribute; empty if the run lacks it."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __get__(self, run: RunRecord, _: object = None) -> str:
+        return run.tags.get(self._name, "")
+
+
 @dataclass(frozen=True, kw_only=True)
 class RunRecord:
     """One run of the sweep."""
@@ -117,39 +127,19 @@ class RunRecord:
     params: Mapping[str, str] = field(default_factory=dict, repr=False)
     tags: Mapping[str, str] = field(default_factory=dict, repr=False)
 
+    node_key = _Tag(names.TAG_NODE_KEY)
+    stage = _Tag(names.TAG_STAGE)
+    variant = _Tag(names.TAG_VARIANT)
+    task = _Tag(names.TAG_TASK)
+    seed = _Tag(names.TAG_SEED)
+    source = _Tag(names.TAG_SOURCE_NODE)
+    """Key of the node that the run starts from; empty for a run from scratch."""
+    entropic_index = _Tag(names.TAG_ENTROPIC_INDEX)
+    """Entropic index in words: `1.5`, or `1 to 2` for a schedule."""
+
     @property
     def is_finished(self) -> bool:
         return self.status == "FINISHED"
-
-    @property
-    def node_key(self) -> str:
-        return self.tags.get(names.TAG_NODE_KEY, "")
-
-    @property
-    def stage(self) -> str:
-        return self.tags.get(names.TAG_STAGE, "")
-
-    @property
-    def variant(self) -> str:
-        return self.tags.get(names.TAG_VARIANT, "")
-
-    @property
-    def task(self) -> str:
-        return self.tags.get(names.TAG_TASK, "")
-
-    @property
-    def seed(self) -> str:
-        return self.tags.get(names.TAG_SEED, "")
-
-    @property
-    def source(self) -> str:
-        """Key of the node that the run starts from; empty for a run from scratch."""
-        return self.tags.get(names.TAG_SOURCE_NODE, "")
-
-    @property
-    def entropic_index(self) -> str:
-        """Entropic index in words: `1.5`, or `1 to 2` for a schedule."""
-        return self.tags.get(names.TAG_ENTROPIC_INDEX, "")
 
     @property
     def failure(self) -> str | None:

@@ -8,7 +8,7 @@ values do not differ once all runs are at the ceiling.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from music_rllib import names
 from music_rllib.results.conditions import Condition
-from music_rllib.results.data import Column, History, Sweep, joined
+from music_rllib.results.data import Column, Sweep, joined
 from music_rllib.results.statistics import Array
 
 
@@ -223,25 +223,6 @@ def first_result(sweep: Sweep, runs: Iterable[int]) -> float:
     return min(ends, default=np.inf)
 
 
-class _Computed(Mapping[str, Column]):
-    """Columns computed from those of another history when they are first read."""
-
-    def __init__(self, history: History, of: Callable[[Column], Column]) -> None:
-        self._history, self._of = history, of
-        self._known: dict[str, Column] = {}
-
-    def __getitem__(self, metric: str) -> Column:
-        if metric not in self._known:
-            self._known[metric] = self._of(self._history[metric])
-        return self._known[metric]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._history)
-
-    def __len__(self) -> int:
-        return len(self._history)
-
-
 def with_pretraining(sweep: Sweep) -> Sweep:
     """The sweep with steps that count from the first step of each run's pretraining.
 
@@ -266,9 +247,10 @@ def with_pretraining(sweep: Sweep) -> Sweep:
         curve = joined(parts)
         return curve.select(np.diff(curve.step, append=np.iinfo(np.int64).max) > 0)
 
-    history = _Computed(
-        sweep.history, lambda column: joined([whole(column, chain) for chain in chains])
-    )
+    history = {
+        metric: joined([whole(column, chain) for chain in chains])
+        for metric, column in sweep.history.items()
+    }
     runs = [
         replace(run, params={**run.params, "env_steps": str(sum(budgets[i] for i in chain))})
         for run, chain in zip(sweep.runs, chains, strict=True)

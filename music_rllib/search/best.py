@@ -17,7 +17,7 @@ from music_rllib.config.schema import Stage
 from music_rllib.config.search import SearchSettings
 from music_rllib.experiment.plan import Plan, short
 from music_rllib.names import in_runs, symbol
-from music_rllib.results.analysis import FinalScores, stage_scopes
+from music_rllib.results.analysis import FinalScores, Scope, stage_scopes
 from music_rllib.results.conditions import ALL_TASKS, Condition, find_stages
 from music_rllib.results.data import Sweep
 from music_rllib.results.statistics import with_interval
@@ -47,12 +47,14 @@ def ranking_metric(stage: Stage, sweep: Sweep) -> RankingMetric:
     return RankingMetric(stage.primary_metric)
 
 
-def _finals(stage: str, sweep: Sweep, metric: str) -> dict[str, Sequence[FinalScores]]:
-    """Final values of a stage's conditions by scope: all tasks, or each task if scales differ."""
+def _scopes(stage: str, sweep: Sweep, metric: str | None) -> dict[str, Scope]:
+    """Final values of a stage's conditions, first over all tasks if these have the same scale.
+
+    `metric` is None for the primary metric of each task.
+    """
     found = next((one for one in find_stages(sweep) if one.name == stage), None)
     scopes = () if found is None else stage_scopes(sweep, found, metric)
-    whole = scopes[:1] if scopes and scopes[0].name == ALL_TASKS else scopes
-    return {scope.name: scope.finals for scope in whole}
+    return {scope.name: scope for scope in scopes}
 
 
 def _values(condition: Condition, plan: Plan, sweep: Sweep) -> dict[str, Any]:
@@ -64,8 +66,9 @@ def condition_of(
     best: Mapping[str, Any], stage: Stage, plan: Plan, sweep: Sweep, metric: str
 ) -> FinalScores | None:
     """The condition that :func:`best_so_far` has described; None if it has no final value."""
-    finals = _finals(stage.name, sweep, metric)
-    for final in finals.get(best.get("task", next(iter(finals), "")), ()):
+    scopes = _scopes(stage.name, sweep, metric)
+    scope = scopes.get(best.get("task", next(iter(scopes), "")))
+    for final in () if scope is None else scope.finals:
         same_seeds = stage.search is None or final.condition.is_fresh == best["on_fresh_seeds"]
         if same_seeds and _values(final.condition, plan, sweep) == best["values"]:
             return final
@@ -103,40 +106,34 @@ def _best_condition(stage: Stage, plan: Plan, sweep: Sweep) -> dict[str, Any] | 
 
     In the second case, the row of the first task has the others under `other_tasks`.
     """
-    metric = ranking_metric(stage, sweep).metric
-    finals = _finals(stage.name, sweep, metric)
-    several = len(finals) > 1
+    scopes = _scopes(stage.name, sweep, None)
+    if ALL_TASKS in scopes:
+        scopes = {ALL_TASKS: scopes[ALL_TASKS]}
+    several = len(scopes) > 1
     rows = [
-        _best_row(task, found, stage, metric, plan, sweep) | ({"task": task} if several else {})
-        for task, found in finals.items()
-        if found
+        _best_row(scope, stage, plan, sweep) | ({"task": task} if several else {})
+        for task, scope in scopes.items()
+        if scope.finals
     ]
     if not rows:
         return None
     return rows[0] | ({"other_tasks": rows[1:]} if several else {})
 
 
-def _best_row(
-    task: str,
-    finals: Sequence[FinalScores],
-    stage: Stage,
-    metric: str,
-    plan: Plan,
-    sweep: Sweep,
-) -> dict[str, Any]:
+def _best_row(scope: Scope, stage: Stage, plan: Plan, sweep: Sweep) -> dict[str, Any]:
     """The condition with the best mean, among complete ones if there are any."""
 
     def planned(final: FinalScores) -> int:
         tasks = [sweep.runs[run].task for run in final.condition.runs]
-        return len(tasks) if task == ALL_TASKS else tasks.count(task)
+        return len(tasks) if scope.name == ALL_TASKS else tasks.count(scope.name)
 
-    ranked = [final for final in finals if final.runs == planned(final)] or finals
+    ranked = [one for one in scope.finals if one.runs == planned(one)] or scope.finals
     best = max(ranked, key=lambda final: final.value)
     return {
         "stage": stage.name,
         "values": _values(best.condition, plan, sweep),
-        "by": names.word_of(metric),
-        "metric": metric,
+        "by": names.word_of(scope.metric),
+        "metric": scope.metric,
         "direction": "maximize",
         "value": best.value,
         "level": sum(math.isclose(final.value, best.value) for final in ranked) - 1,

@@ -73,15 +73,12 @@ class SearchController(Listener):
             self._reports.setdefault(node.key, {}).update(by_step)
 
     def finished(self, node: Node, result: RunResult) -> None:
-        """Score the trials whose last run has finished."""
         self._score_trials()
 
     def paused(self, node: Node) -> None:
-        """Score the trials whose last run has reached the rung."""
         self._score_trials()
 
     def failed(self, node: Node, failure: Failure) -> None:
-        """End the trials whose run has failed."""
         self._score_trials()
 
     def tick(self) -> None:

@@ -8,7 +8,7 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from socket import gethostname
 from typing import TYPE_CHECKING, Any
 
@@ -96,7 +96,8 @@ def compute_and_report(
         stopped_by = _compute(opened, display, mlflow_log, state_file, controller, wait_minutes)
         searches = [] if controller is None else end_searches(opened, controller, tracker)
         tracker.keep_current(node.key for node in opened.plan.nodes)  # with trials since then
-        lost = _lost_trials(searches)
+        # Trials that failed because a run failed, under earlier drivers too.
+        lost = sum(t["lost"] for one in searches for arm in one["arms"] for t in arm["trials"])
         failed = (
             bool(opened.scheduler.having(Status.FAILED, Status.SKIPPED))
             or lost > 0
@@ -132,11 +133,6 @@ def compute_and_report(
     if report is not None:
         console.print(report, soft_wrap=True)
     return FAILED if failed else 0
-
-
-def _lost_trials(searches: Sequence[Mapping[str, Any]]) -> int:
-    """Number of trials that failed because a run failed, under earlier drivers too."""
-    return sum(t["lost"] for one in searches for arm in one["arms"] for t in arm["trials"])
 
 
 def _take_over_reused(opened: OpenSweep, display: Display, mlflow_log: MlflowListener) -> None:

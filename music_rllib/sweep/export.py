@@ -53,12 +53,14 @@ def export_best(location: SweepLocation, stage_name: str | None, output: Path) -
     best = _best(opened, stage, sweep, metric, searches)
     others = best.pop("other_tasks", None)
     if not others:
-        chosen = _export_condition(opened, stage, sweep, best, metric, output)
+        own = metric if stage.search else best["metric"]
+        chosen = _export_condition(opened, stage, sweep, best, own, output)
         _remove_others(output, chosen["policies"])
         return chosen
     rows = [best, *others]
     exported = [
-        _export_condition(opened, stage, sweep, row, metric, output / row["task"]) for row in rows
+        _export_condition(opened, stage, sweep, row, row["metric"], output / row["task"])
+        for row in rows
     ]
     why = (f"{row['task']}: {one['why']}" for row, one in zip(rows, exported, strict=True))
     policies = [policy for one in exported for policy in one["policies"]]

@@ -18,7 +18,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import TracebackType
 from typing import Self
 from urllib.parse import urlencode
 from weakref import WeakValueDictionary
@@ -237,16 +236,8 @@ class Tracker:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if kind is None:
-            self.close("FINISHED")
-        else:
-            self.close("KILLED" if is_stop(error) else "FAILED")
+    def __exit__(self, _: object, error: BaseException | None, *rest: object) -> None:
+        self.close("FINISHED" if error is None else "KILLED" if is_stop(error) else "FAILED")
 
     def _parent_run(self, config: Mapping[str, object]) -> RunQueue:
         """The parent run. It is created at once, as its children need its id."""

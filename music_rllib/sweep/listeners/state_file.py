@@ -80,9 +80,7 @@ class StateFile(Listener):
         self._thread.start()
         return self
 
-    def __exit__(
-        self, _kind: type[BaseException] | None, error: BaseException | None, *_: object
-    ) -> None:
+    def __exit__(self, _: object, error: BaseException | None, *rest: object) -> None:
         if self._driver["ended"] is None:
             self.end("stopped" if is_stop(error) else "failed")
 

@@ -41,8 +41,6 @@ def compare_stage(
     if settings.search is not None:
         metrics.add(settings.search.objectives[0].metric)
     read = read_stored(location, metrics=metrics)
-    if metric is not None:
-        _check_metric(read, metric)
     sweep, ranking = read.sweep, ranking_metric(settings, read.sweep)
     shown = metric or (ranking.metric if settings.search else None)
     maximised = not minimize and (ranking.maximised or shown != ranking.metric)
@@ -61,7 +59,11 @@ def compare_stage(
     earlier = [Text(sweep.earlier)] if sweep.earlier else []
     final = analyse_stage(sweep, study.stage, shown) if study.stage else None
     if final is None or not any(scope.finals for scope in final.scopes):
+        if metric is not None:
+            _check_metric(read, settings.name, metric)
         text = f"Stage {settings.name} of {sweep.name} has no finished run yet."
+        if any(run.is_finished and run.stage == settings.name for run in sweep.runs):
+            text = f"No run of stage {settings.name} has reported {shown or ranking.metric}."
         planned = map(Text, document["answer"] if study.claims else ())
         return document, Group(*planned, Text(text), *earlier)
     lines: list[RenderableType] = [*map(Text, document["answer"]), *earlier, Text()]
@@ -87,8 +89,14 @@ def _environments(sweep: Sweep, stage: str) -> list[str]:
     )
 
 
-def _check_metric(read: SweepRead, metric: str) -> None:
-    if metric not in read.sweep.history and read.opened is not None and any(read.opened.finished):
-        results = read.opened.results().values()
-        known = sorted({name for result in results for name in result.metrics})
-        raise BadInputError(f"--metric must be one of {', '.join(known)}, got {metric!r}")
+def _check_metric(read: SweepRead, stage: str, metric: str) -> None:
+    """Refuse a metric that no finished run of the stage has; another stage's runs may have it."""
+    if read.opened is None:
+        return
+    results = read.opened.results()
+    own = (results.get(node.key) for node in read.opened.plan.nodes if node.stage == stage)
+    known = sorted({name for result in own if result is not None for name in result.metrics})
+    if known and metric not in known:
+        raise BadInputError(
+            f"--metric must be one of {', '.join(known)} in stage {stage}, got {metric!r}"
+        )

@@ -171,12 +171,13 @@ def test_runs_with_diverged_critics_are_listed() -> None:
                 run(3, -41.0, known, 0.0),
                 run(4, -41.0, known | {"music.task_reward": "False"}),
                 run(5, -59.0, known, of=names.INTRINSIC_WEIGHT),
+                run(6, -41.0, known | {"music.task_reward": "False", "task.reward_range": "None"}),
             ]
         )
     )
     (said,) = [line for line in report.limitations if "critics" in line]
-    assert said.startswith("The critics of 3 runs diverged, to values that no reward explains")
-    assert [f"seed{seed}" in said for seed in range(6)] == [False, True, False, True, True, False]
+    assert said.startswith("The critics of 4 runs diverged, to values that no reward explains")
+    assert [seed for seed in range(7) if f"seed{seed}" in said] == [1, 3, 4, 6]
 
 
 LOW, HIGH = [0.3, 0.32, 0.35, 0.31, 0.3], [0.9, 0.92, 0.88, 0.95, 0.9]

@@ -15,6 +15,7 @@ from rich.console import Console
 from scipy import stats
 
 from music_rllib import names
+from music_rllib.experiment.plan import make_plan
 from music_rllib.report.figures.choice import drawings_of_stages, study_drawings
 from music_rllib.report.figures.draw import files
 from music_rllib.results.analysis import curve
@@ -29,7 +30,7 @@ from music_rllib.results.analysis_plan import as_document as plans_as_document
 from music_rllib.results.answer import answer, claim_in_words, power_in_words
 from music_rllib.results.claims import Verdict, contrast, verdict_of
 from music_rllib.results.conditions import find_stages
-from music_rllib.results.data import Points, RunRecord, Sweep, columns
+from music_rllib.results.data import LastValues, Points, RunRecord, Sweep, columns
 from music_rllib.results.scores import measure_on, scores_of, with_pretraining
 from music_rllib.results.statistics import (
     Estimate,
@@ -1153,3 +1154,73 @@ def test_all_stages_before_a_stage_count_in_auc_total(tmp_path: Path) -> None:
     found = analysis_plan(loaded(tmp_path, document))
     assert found is not None
     assert found.budget == {"FetchPush": 15_000}
+
+
+def test_a_reward_with_and_without_its_own_setting_are_two_conditions(tmp_path: Path) -> None:
+    for values, words in (
+        ([{}, {"hidden": 128}], "hidden = 128"),
+        ([{"hidden": 128}, {"hidden": 128, "features": 32}], "features = 32"),
+    ):
+        stage = {"name": "train", "variant": "tac", "grid": {"intrinsic.settings": values}}
+        defaults = {"env_steps": 2000, "intrinsic": {"reward": "rnd"}}
+        document = {"name": "s", "tasks": ["FetchPush"], "seeds": [0, 1], "stages": [stage]}
+        plan = make_plan(loaded(tmp_path, document | {"defaults": defaults}))
+        (found,) = find_stages(LastValues(plan).sweep({}))
+        assert [(one.label, len(one.runs)) for one in found.conditions] == [
+            ("q = 1", 2),
+            (f"q = 1, intrinsic.settings.{words}", 2),
+        ]
+
+
+def test_tasks_with_their_own_q_share_a_condition() -> None:
+    rng = np.random.default_rng(0)
+    runs = [
+        run({"tac.entropic_index": q, "tac.alpha": alpha}, seed, 0.3, rng, task, alpha=alpha)
+        for task, q in (("FetchPush", "1"), ("FetchSlide", "1.5"))
+        for alpha in ("0.05", "0.1")
+        for seed in range(5)
+    ]
+    found = study_of(sweep_of(runs))
+    assert found.stage is not None
+    assert [one.label for one in found.stage.conditions] == ["α = 0.05", "α = 0.1"]
+    assert (len(found.unplanned), found.family) == (3, 3)
+    alone = [one for one in runs if one[0].params["tac.alpha"] == "0.1"]
+    (condition,) = find_stages(sweep_of(alone))[0].conditions
+    assert condition.label == "q of each task"
+
+
+def test_a_metric_that_no_run_reported_is_no_failure() -> None:
+    sweep = sweep_of(study({"1": 0.2, "1.5": 0.3}, 5, np.random.default_rng(0)))
+    sentences = answer(sweep, study_of(sweep, metric=names.MI_BOUND))
+    assert sentences[1] == "No finished run has reported the metric."
+
+
+def test_an_alpha_of_each_task_is_not_averaged_over(tmp_path: Path) -> None:
+    stage = {
+        "name": "train",
+        "variant": "tac",
+        "tac": {"alpha": 0.05},
+        "per_task": {"FetchSlide": {"tac": {"alpha": 0.1}}},
+        "grid": {"tac.entropic_index": [1.0, 1.5]},
+    }
+    document = {
+        "name": "s",
+        "tasks": ["FetchPush", "FetchSlide"],
+        "seeds": [0, 1, 2, 3, 4],
+        "defaults": {"env_steps": 2000},
+        "analysis": {"hypotheses": ["q = 1.5 against q = 1"]},
+        "stages": [stage],
+    }
+    plan = analysis_plan(loaded(tmp_path, document))
+    assert plan is not None
+    text = "α of its own for each task: 0.05 on FetchPush, 0.1 on FetchSlide"
+    assert plan.control == text
+    rng = np.random.default_rng(0)
+    runs = [
+        run({"tac.entropic_index": q}, seed, 0.3, rng, task, alpha=alpha)
+        for task, alpha in (("FetchPush", "0.05"), ("FetchSlide", "0.1"))
+        for q in ("1", "1.5")
+        for seed in range(5)
+    ]
+    sweep = sweep_of(runs)
+    assert f"Control: {text}." in answer(sweep, study_of(sweep))

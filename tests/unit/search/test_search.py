@@ -19,10 +19,13 @@ from music_rllib import names
 from music_rllib.config.load import load_config, warnings_of
 from music_rllib.config.problems import ConfigError
 from music_rllib.config.search import Objective, Pruning, Rung, SearchSettings
+from music_rllib.experiment.plan import make_plan
+from music_rllib.results.data import LastValues
+from music_rllib.search.best import best_so_far
 from music_rllib.search.objective import aggregate, interval, reason_to_prune, score, up_to
 from music_rllib.search.sampler import VALUES, Proposer, trial_at
 from music_rllib.search.study import fits
-from music_rllib.store.history import Report
+from music_rllib.store.history import Report, RunResult
 from tests.played_search import Document, document
 from tests.sweep_files import loaded
 
@@ -536,3 +539,31 @@ def test_a_run_without_a_finite_score_is_named(bad: float) -> None:
         score(Objective(), history, 3)
     with pytest.raises(ValueError, match="never reported evaluation/success_rate"):
         score(Objective(), [report(1)], 3)
+
+
+def test_the_best_condition_of_a_task_is_that_of_its_own_metric(tmp_path: Path) -> None:
+    swing = {"env_id": "Pendulum-v1", "success_key": None, "horizon": 200}
+    stage = {"name": "train", "variant": "tac", "grid": {"tac.entropic_index": [1.0, 1.5]}}
+    document = {
+        "name": "s",
+        "tasks": ["FetchReach", "Swing"],
+        "seeds": [0],
+        "environments": {"Swing": swing},
+        "defaults": {"env_steps": 2000},
+        "stages": [stage],
+    }
+    config = loaded(tmp_path, document)
+    plan, results = make_plan(config), {}
+    for node in plan.nodes:
+        success = 0.9 if node.run.tac.entropic_index == 1.5 else 0.5
+        metrics = {names.EVAL_RETURN: -30 * success}
+        if node.run.task.name == "FetchReach":
+            metrics[names.EVAL_SUCCESS] = success
+        results[node.key] = RunResult(
+            label=node.label, env_steps=2000, seconds=1.0, metrics=metrics
+        )
+    best = best_so_far(config.stages, plan, LastValues(plan).sweep(results), ())
+    assert best is not None
+    assert (best["task"], best["metric"]) == ("FetchReach", names.EVAL_SUCCESS)
+    assert best["values"] == {"tac.entropic_index": 1.5}
+    assert best["other_tasks"][0]["metric"] == names.EVAL_RETURN
