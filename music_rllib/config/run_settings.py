@@ -278,6 +278,8 @@ class RunSettings(StrictModel):
         if self.replay.hindsight_episodes == "moved" and self.task.moved_distance is not None:
             settings["task"]["moved_distance"] = self.task.moved_distance
         settings["tac"]["precision"] = "float32"  # a removed setting
+        if self.music.bound == "smile":
+            settings["music"]["pairs"] = "not clipped"  # they were, until 2026-11-29
         if self.replay.symmetries:
             symmetries = self.task.symmetries.model_dump(mode="json")
             used = {kind: symmetries[kind] for kind in self.replay.symmetries}

@@ -91,7 +91,7 @@ class Recording:
         self._frames = np.zeros((layout.horizon + 1, layout.frame), np.float32)
         self._actions = np.zeros((layout.horizon, layout.action), np.float32)
         self._rewards = np.zeros(layout.horizon, np.float32)
-        self._successes: list[bool] = []
+        self._successes: list[bool | None] = []
         self.steps = 0
 
     @property
@@ -124,8 +124,7 @@ class Recording:
         except ValueError as error:
             raise BadNumberError.at(self.place, error) from None
         self._rewards[self.steps - 1] = number
-        if success is not None:
-            self._successes.append(success)
+        self._successes.append(success)
 
     def ends(self, terminated: Any, truncated: Any) -> tuple[bool, bool]:
         """The flags of the last step as bools; raises BadNumberError for other values."""
@@ -164,11 +163,17 @@ class Recording:
             self._actions[:n],
             self._rewards[:n],
             terminated,
-            np.array(self._successes) if self._successes else None,
+            self._flags(),
         )
         if self._goal_reward is not None and not self._zero_goal:
             self._check_hindsight(self._goal_reward, episode)
         return episode
+
+    def _flags(self) -> NDArray[np.bool_] | None:
+        """[n] successes; None if no step reported one. A step without a report is none."""
+        if all(each is None for each in self._successes):
+            return None
+        return np.array([each is True for each in self._successes])
 
     def _check_hindsight(self, reward: GoalReward, episode: Episode) -> None:
         goals = episode.frames[:, self._layout.observation :]

@@ -124,7 +124,12 @@ class MutualInformationEstimator(nn.Module):
         )
 
     def bound(
-        self, observations: Tensor, permutations: Tensor, inside: Tensor | None = None
+        self,
+        observations: Tensor,
+        permutations: Tensor,
+        inside: Tensor | None = None,
+        *,
+        of_pairs: bool = False,
     ) -> Tensor:
         """Bound on I(surrounding; agent) of each trajectory: [N] nats.
 
@@ -132,15 +137,19 @@ class MutualInformationEstimator(nn.Module):
             observations: [N, T, D]
             permutations: [N, T] of time, for the product of the marginals.
             inside: [N, T] False for padding after the end of trajectories; None: no padding.
+            of_pairs: Do not clip statistics (`smile`). With the clip, which only the product of
+                marginals has, surroundings at rest would have a positive bound.
         """
+        kind = "moving_average" if of_pairs and self.kind == "smile" else self.kind
         if self.compiled and observations.device.type == "cpu" and not torch.is_grad_enabled():
             data = self.data(observations, permutations, inside)
             weights = Weights(*(parameter.detach().numpy() for parameter in self.parameters()))
-            return torch.from_numpy(bounds(data, self._bound(observations), weights))
+            bound = self._bound(observations)._replace(kind=BOUNDS.index(kind))
+            return torch.from_numpy(bounds(data, bound, weights))
         joint, marginals = self._statistics(observations, permutations, inside)
-        if self.kind == "capped":
+        if kind == "capped":
             return donsker_varadhan(joint, marginals[0], inside)
-        return other_bound(self.kind, joint, marginals, inside)
+        return other_bound(kind, joint, marginals, inside)
 
     def _bound(self, trajectories: Tensor | Array) -> Bound:
         """The kind of bound for [N, T, ...] trajectories as compiled code takes it."""
@@ -193,7 +202,8 @@ class MutualInformationEstimator(nn.Module):
         Each transition is a trajectory of two frames, shuffled in time by `two_frames`.
         """
         frames = self.pairs(states, followers)
-        return self.bound(frames, two_frames(len(frames), tuple(swapped), frames.device))
+        permutations = two_frames(len(frames), tuple(swapped), frames.device)
+        return self.bound(frames, permutations, of_pairs=True)
 
     def pairs(self, states: Tensor, followers: Tensor) -> Tensor:
         """[..., B, D] states and next states -> [..., B, 2, d] the columns that are used."""

@@ -67,6 +67,12 @@ class IntrinsicReward(nn.Module, ABC):
     """
     smallest_scale: ClassVar[float] = 0.0
     """Lower limit of that scale, so that noise earns nothing if there is nothing else."""
+    by_minibatch: ClassVar[bool] = False
+    """Whether a bonus depends on the other transitions of its minibatch.
+
+    Fresh episodes are one batch and would have other rewards than in training, so there is no
+    metric `critics/bias`.
+    """
     by_episode: ClassVar[bool] = False
     """Whether the class overrides `of_episode`."""
     trajectories: ClassVar[int] = 0

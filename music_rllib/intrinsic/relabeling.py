@@ -73,10 +73,10 @@ class RewardLearner:
             found.append(cast("Tensor", values).cpu().numpy())
         return found
 
-    def observe(self, batch: Batch, episodes: Sequence[Trajectory]) -> Tensor:
-        """[steps] reward of fresh episodes, whose transitions are the batch."""
-        if self.reward.by_episode:
-            stored = torch.from_numpy(np.concatenate(self.values_of(episodes)))
+    def observe(self, batch: Batch, values: Sequence[Floats] | None) -> Tensor:
+        """[steps] reward of fresh episodes with these `values_of`, whose steps are the batch."""
+        if values is not None:
+            stored = torch.from_numpy(np.concatenate(values))
             batch = batch._replace(stored=stored.to(batch.states.device))
         return self.reward.reward(batch, learning=False)[0]
 

@@ -88,6 +88,8 @@ class DISCERN(_OfGoals):
     https://arxiv.org/abs/1811.11359, eq. 5
     """
 
+    by_minibatch = True
+
     def __init__(
         self, sizes: Sizes, *, hidden: int = 64, features: int = 16, beta: float = 10.0
     ) -> None:

@@ -357,7 +357,9 @@ def _compiled_for(sources: str) -> Any:
         found = np.empty(len(transitions.others), transitions.agent.dtype)
         means = np.empty(updates, transitions.agent.dtype)
         rows, count = len(found) // updates, len(trajectories.others) // updates
-        of_pairs = Bound(bound.kind, 2, bound.log_average)
+        # Unclipped, as in `MutualInformationEstimator.bound` with `of_pairs`.
+        kind = _MOVING_AVERAGE if bound.kind == _SMILE else bound.kind
+        of_pairs = Bound(kind, 2, bound.log_average)
         for k in range(updates):
             some = found[k * rows : (k + 1) * rows]
             _bounds(_rows(transitions, k * rows, rows), of_pairs, weights, some)

@@ -118,7 +118,18 @@ class TrajectoryReplay(TrajectoryRing):
 
         MUSIC-p gives `priorities` [N] with every call: episodes are drawn by their rank. An
         intrinsic reward by episode gives N arrays of `values` [n], one for each step.
+
+        Raises:
+            ValueError: the trajectories held, of a checkpoint, have no priorities or values, or
+                priorities are missing.
         """
+        if self.trajectories and (priorities is not None) != bool(len(self._priorities)):
+            raise ValueError("music.prioritise_replay must be that of the checkpoint")
+        if self.trajectories and values is not None and self._values is None:
+            raise ValueError(
+                "intrinsic.reward must be that of the checkpoint, whose replay lacks its numbers "
+                "of each step"
+            )
         for i, trajectory in enumerate(trajectories):
             start, steps = self._store(trajectory), len(trajectory)
             if self._only_moved:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
@@ -25,6 +26,7 @@ from ray.rllib.utils.metrics import (
 from ray.rllib.utils.typing import StateDict
 
 from music_rllib.envs.episodes import Episode
+from music_rllib.envs.features import Symmetries
 from music_rllib.envs.goal_functions import (
     augmentation_of,
     goal_end_of,
@@ -66,6 +68,8 @@ class TAC(Algorithm):
         return TACConfig()
 
     def setup(self, config: TACConfig) -> None:
+        if self.config.env is None:
+            raise ValueError("an environment must be set: TACConfig().environment(...)")
         with determinism_without_compiler():
             super().setup(config)
         self._settings: AlgorithmSettings = self.config.settings
@@ -88,8 +92,9 @@ class TAC(Algorithm):
             moved_distance = moved_distance_of(runner.env, goal_reward, seeds[0])
         augment = None
         if settings.symmetries:
+            of_task = Symmetries.model_validate(self.config.task_symmetries)  # Tune gives a dict
             augment = augmentation_of(
-                self.config.task_symmetries, settings.symmetries, runner.layout, runner.env,
+                of_task, settings.symmetries, runner.layout, runner.env,
                 reward=goal_reward, goals=self._settings.music.goals == "environment",
                 seed=seeds[0],
             )  # fmt: skip
@@ -139,11 +144,10 @@ class TAC(Algorithm):
         with self.metrics.log_time((TIMERS, ENV_RUNNER_SAMPLING_TIMER)):
             episodes = self._collect(random_actions=not explored)
         self._observe_inputs(episodes)
+        values = self._values_to_store(episodes)
         if explored:
-            self.learner_group.foreach_learner(lambda learner: learner.diagnose(episodes))
-        self.replay.extend(
-            episodes, self._trajectory_priorities(episodes), self._values_to_store(episodes)
-        )
+            self.learner_group.foreach_learner(lambda learner: learner.diagnose(episodes, values))
+        self.replay.extend(episodes, self._trajectory_priorities(episodes), values)
         schedule, budget = self._settings.replay.importance_exponent, self.config.total_env_steps
         exponent = value_at(schedule, self.env_steps, budget or 0)
         for updates in self._updates_due():
@@ -185,6 +189,12 @@ class TAC(Algorithm):
             )
         results = super().evaluate(*args, **kwargs)
         success = results.get(ENV_RUNNER_RESULTS, {}).get(SUCCESS_LAST)
+        if success is None and self.config.follows_success and results.get(ENV_RUNNER_RESULTS):
+            warnings.warn(
+                "a setting follows the success rate, and no episode has reported "
+                f"info[{self.config.success_key!r}]: is the config's success_key right?",
+                stacklevel=2,
+            )
         if success is not None:
             rate, env_steps = float(success), self.env_steps
             self.learner_group.foreach_learner(
@@ -238,8 +248,8 @@ class TAC(Algorithm):
             if self._runner_states.keys() - samples.keys():
                 if time.monotonic() > give_up:
                     raise RuntimeError(
-                        f"environment runners {sorted(missing)} died and did not come back within "
-                        f"{REVIVE_SECONDS:.0f} s"
+                        f"environment runners {sorted(missing)} died and finished no episode "
+                        f"within {REVIVE_SECONDS:.0f} s: their logs say why"
                     )
                 restored = self.restore_env_runners(self.env_runner_group)
                 if not restored:

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.core.columns import Columns
+from ray.rllib.core.learner.torch.torch_learner import TorchLearner
 from torch import Tensor, nn
 
 from music_rllib import names
@@ -27,7 +28,8 @@ from music_rllib.tac.networks import Critics, Perceptron, RunningNormaliser
 from music_rllib.tac.rl_module import EstimatorModule, TACModule
 
 __all__ = [
-    "CompiledUpdate", "FusedAdam", "Learned", "flushed_denormals", "needs_autograd", "use_threads",
+    "CompiledUpdate", "FusedAdam", "Learned", "flushed_denormals", "needs_autograd",
+    "postprocesses_gradients", "use_threads",
 ]  # fmt: skip
 
 HOOKS = (
@@ -61,6 +63,13 @@ def needs_autograd(
         or config.num_learners > 1
     )
     return own_hooks or own_loss or uses_gradients or type(module) is not TACModule
+
+
+def postprocesses_gradients(learner: type[TorchLearner], config: AlgorithmConfig) -> bool:
+    """Whether RLlib's part of `postprocess_gradients` has anything to do."""
+    own = learner.postprocess_gradients_for_module
+    is_own = own is not TorchLearner.postprocess_gradients_for_module
+    return is_own or config.grad_clip is not None or config.log_gradients
 
 
 class Learned(NamedTuple):

@@ -64,7 +64,7 @@ class TACConfigBase(AlgorithmConfig):
         self._settings: AlgorithmSettings | None = None
         for model, prefix in _MODELS:
             for name, field in model.model_fields.items():
-                setattr(self, prefix + name, field.default)
+                setattr(self, prefix + name, field.get_default(call_default_factory=True))
         self.total_env_steps: int | None = None
         self.torch_threads = 1
         self.seed_range: tuple[int, int] = (0, LAST_SEED)
@@ -312,6 +312,13 @@ class TACConfigBase(AlgorithmConfig):
                     f"{name}.follows: success_rate needs evaluations: set "
                     "evaluation(evaluation_interval=...)"
                 )
+
+    @property
+    def follows_success(self) -> bool:
+        """Whether a setting follows the success rate."""
+        tac, music, _, _, intrinsic = self.settings
+        values = tac.entropic_index, music.mi_reward_weight, intrinsic.weight
+        return any(isinstance(v, Measured) and v.follows == "success_rate" for v in values)
 
     # -- defaults for RLlib ---------------------------------------------------------------
 

@@ -9,6 +9,7 @@ simulator state between calls: a checkpoint of a few integers resumes it exactly
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -177,6 +178,10 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
             steps = sum(len(episode) for episode in episodes)
             if len(episodes) >= (num_episodes or 0) and steps >= (num_timesteps or 0):
                 break
+        if any(episode.successes is not None for episode in episodes):
+            # The environment reports success: steps and episodes without the key are none.
+            self._success = (self._success[0], False)
+            episodes = list(map(_with_success, episodes))
         self._log(episodes, steps)
         self._callbacks.sample_ended()
         return episodes
@@ -290,11 +295,10 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
         log(NUM_EPISODES, len(episodes), reduce="sum")
         log(NUM_ENV_STEPS_SAMPLED_LIFETIME, steps, reduce="lifetime_sum", with_throughput=True)
         log(NUM_EPISODES_LIFETIME, len(episodes), reduce="lifetime_sum")
-        # The mean over an iteration: RLlib does not keep a window from one iteration to the next.
-        window = max(len(episodes), self.config.metrics_num_episodes_for_smoothing)
+        # Without a window, which RLlib would keep from the first call, of fewer episodes.
         for episode in episodes:
             for name, value in self._episode_metrics(episode):
-                log(name, value, window=window)
+                log(name, value, reduce="mean")
 
     def _episode_metrics(self, episode: Episode) -> Iterator[tuple[str, float]]:
         yield EPISODE_LEN_MEAN, float(len(episode))
@@ -322,6 +326,7 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
         if components is None:  # RLlib gives parts of a training runner to evaluation runners
             state["episodes_started"] = self._episodes_started
             state["rng"] = self._rng.bit_generator.state
+            state["reports_success"] = self._success[1] is False
         if self._check_component(COMPONENT_RL_MODULE, components, not_components):
             state[COMPONENT_RL_MODULE] = self.module.get_state(**kwargs)
             state[WEIGHTS_SEQ_NO] = self._weights_seq_no
@@ -331,6 +336,8 @@ class TrajectoryEnvRunner(EnvRunner, Checkpointable):
         if "rng" in state:
             self._episodes_started = int(state["episodes_started"])
             self._rng.bit_generator.state = state["rng"]
+            if state.get("reports_success"):
+                self._success = (self._success[0], False)
         if COMPONENT_RL_MODULE in state:
             # RLlib's runner skips weights with an older sequence number, so it would keep newer
             # weights if an earlier checkpoint is restored in the same process.
@@ -375,6 +382,13 @@ def colored_noise(rng: np.random.Generator, exponent: float, shape: tuple[int, .
     twice[[0, -1] if steps % 2 == 0 else 0] = 1.0
     scaled: Floats = (noise / np.sqrt((twice * scale**2).sum() / steps)).astype(np.float32)
     return scaled
+
+
+def _with_success(episode: Episode) -> Episode:
+    """The episode, without success if no step reported one."""
+    if episode.successes is not None:
+        return episode
+    return replace(episode, successes=np.zeros(len(episode), np.bool_))
 
 
 def _bad_action(actions: Floats, inputs: Floats, places: list[str]) -> BadNumberError:

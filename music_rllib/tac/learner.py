@@ -30,7 +30,7 @@ from music_rllib.intrinsic.interface import Sizes
 from music_rllib.intrinsic.make import make_reward
 from music_rllib.intrinsic.music import Music
 from music_rllib.intrinsic.relabeling import RewardLearner
-from music_rllib.replay.trajectories import Trajectory
+from music_rllib.replay.trajectories import Floats, Trajectory
 from music_rllib.runtime.process import keep_freed_memory, use_reproducible_gpu_kernels
 from music_rllib.runtime.quiet import quiet_third_parties
 from music_rllib.schedules import Quantity
@@ -40,6 +40,7 @@ from music_rllib.tac.compiled_update import (
     FusedAdam,
     flushed_denormals,
     needs_autograd,
+    postprocesses_gradients,
     use_threads,
 )
 from music_rllib.tac.diagnostics import FreshEpisodes, critic_bias
@@ -205,9 +206,8 @@ class TACLearner(TorchLearner):
     def postprocess_gradients(self, gradients_dict: ParamDict) -> ParamDict:
         """Skip RLlib's sorting of gradients if nothing is clipped or logged."""
         given = {key: one for key, one in gradients_dict.items() if one is not None}  # policy_delay
-        if self.config.grad_clip is None and not self.config.log_gradients:
-            return given
-        return super().postprocess_gradients(given)
+        has_more = postprocesses_gradients(type(self), self.config)
+        return super().postprocess_gradients(given) if has_more else given
 
     def _step(self, minibatch: Minibatches) -> dict[str, Tensor]:
         """Update every network except the targets by autograd, on one minibatch.
@@ -350,23 +350,23 @@ class TACLearner(TorchLearner):
     # -- fresh episodes, TD errors --------------------------------------------------------
 
     @torch.no_grad()
-    def diagnose(self, episodes: Sequence[Trajectory]) -> None:
-        """Measure fresh episodes of the policy before they are trained on.
+    def diagnose(self, episodes: Sequence[Trajectory], values: Sequence[Floats] | None) -> None:
+        """Measure fresh episodes of the policy before they are trained on: the critics' bias.
 
-        Log the critics' bias at their first steps; the intrinsic reward keeps its own measures.
+        `values` are those that the replay keeps for an intrinsic reward by episode.
         """
         fresh = FreshEpisodes.of(episodes, self._policy_module.input_size, self._device)
-        rewards = fresh.rewards
-        states, followers = fresh.states, fresh.followers
+        rewards, states, followers = fresh.rewards, fresh.states, fresh.followers
         if self._music.is_on:
             intrinsic = self._music.observe(episodes, states, followers, self._generator)
             rewards = self._music.total(rewards, intrinsic, self._now.mi_reward_weight)
         if self.bonus is not None:
             batch = self.bonus.batch(states, fresh.actions, followers, self._generator)
-            rewards = self._with_bonus(rewards, self.bonus.observe(batch, episodes))
+            rewards = self._with_bonus(rewards, self.bonus.observe(batch, values))
         noise = self._policy_noise(fresh.actions)
         bias = critic_bias(fresh, rewards, self._policy_module, self._objective, noise)
-        self.metrics.log_value((DEFAULT_MODULE_ID, names.Q_BIAS), bias, window=1)
+        if self.bonus is None or not self.bonus.reward.by_minibatch:
+            self.metrics.log_value((DEFAULT_MODULE_ID, names.Q_BIAS), bias, window=1)
 
     @torch.no_grad()
     def trajectory_priorities(self, episodes: Sequence[Trajectory]) -> NDArray[np.float64]:

@@ -57,10 +57,15 @@ _REMEDIES: dict[str, tuple[str, ...]] = {
     "environment runners compute on the CPU": ("num_gpus_per_env_runner",),
     "updates on a CPU are compiled already": ("torch_compile_learner", "torch_compile_worker"),
     "set learners(num_gpus_per_learner=...)": ("num_gpus",),
-    "TAC trains one policy in a single-agent environment": ("policies_to_train", "observation_fn"),
+    "TAC trains one policy in a single-agent environment": (
+        "policies_to_train", "observation_fn", "count_steps_by",
+    ),
     "TAC learns from its own replay: save and restore checkpoints": ("input_", "output"),
     "set min_sample_timesteps_per_iteration": ("min_train_timesteps_per_iteration",),
     "log metrics in callbacks": ("keep_per_episode_custom_metrics",),
+    "results are means over an iteration: set reporting(min_sample_timesteps_per_iteration=...)": (
+        "metrics_num_episodes_for_smoothing",
+    ),
     "losses and gradients are float32": ("_torch_grad_scaler_class",),
 }  # fmt: skip
 """Instruction for the user to the attributes of `AlgorithmConfig` that it replaces."""
@@ -71,6 +76,8 @@ NEVER_CALLED = (
     "on_evaluate_offline_end", "on_offline_eval_runners_recreated",
 )  # fmt: skip
 """Callbacks of RLlib's old API stack and of offline evaluation."""
+_ACTING = ("_forward_exploration", "forward_exploration", "_forward_inference", "forward_inference")
+"""Methods of a module by which TAC's runners do not act."""
 
 
 def ignored_settings(config: AlgorithmConfig) -> Iterator[str]:
@@ -122,4 +129,20 @@ def _unusable_classes(config: AlgorithmConfig) -> Iterator[str]:
             "rl_module(rl_module_spec=...): module_class must be a subclass of "
             f"music_rllib.TACModule, got {spec.module_class.__name__}: override its setup() to "
             "replace networks, because the losses need the policy, the critics and their averages"
+        )
+    else:
+        yield from _unused_of_module(spec)
+
+
+def _unused_of_module(spec: RLModuleSpec) -> Iterator[str]:
+    kind = spec.module_class or TACModule
+    for name in _ACTING:
+        if getattr(kind, name) is not getattr(TACModule, name):
+            yield f"rl_module(rl_module_spec=...): TAC never calls {name}: override act() instead"
+    given = spec.model_config or {}
+    keys = given if isinstance(given, dict) else vars(given)
+    if kind is TACModule and (unused := sorted(set(keys) - {"tac"})):
+        yield (
+            f"rl_module(rl_module_spec=...): model_config's {', '.join(unused)} has no effect on "
+            f"TACModule: {_NETWORKS}"
         )

@@ -354,6 +354,7 @@ HOOKS = (
     "compute_loss_for_module",
     "compute_gradients",
     "postprocess_gradients",
+    "postprocess_gradients_for_module",
     "apply_gradients",
     "configure_optimizers_for_module",
 )
@@ -461,7 +462,7 @@ def test_the_learner_accepts_read_only_arrays(monkeypatch: pytest.MonkeyPatch) -
         warnings.filterwarnings("error", ".*not writable")
         learner_.observe_inputs(episodes[0].frames[:, : learner_._policy_module.input_size])
         learner_.trajectory_priorities(episodes)
-        learner_.diagnose(episodes)
+        learner_.diagnose(episodes, None)
         learner_.set_state(read_only(learner_.get_state()))
         while not algo.grad_updates:
             algo.train()

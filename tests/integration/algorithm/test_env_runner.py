@@ -11,7 +11,7 @@ from ray.rllib.callbacks.callbacks import RLlibCallback
 
 from music_rllib.envs.values import BadNumberError
 from music_rllib.tac.algorithm import TACConfig
-from music_rllib.tac.env_runner import TrajectoryEnvRunner, colored_noise
+from music_rllib.tac.env_runner import SUCCESS_LAST, TrajectoryEnvRunner, colored_noise
 from music_rllib.tac.networks import RunningNormaliser
 
 
@@ -384,3 +384,27 @@ def test_a_non_finite_action_stops_before_the_environment() -> None:
     with pytest.raises(BadNumberError, match=r"step 0: the policy's action\[0\] is nan, it must"):
         made.sample()
     assert not any(env.seen for env in made.envs if isinstance(env, Countdown))
+
+
+def test_episodes_without_the_success_key_count_if_others_have_it() -> None:
+    class Lucky(Countdown):
+        """Reports success, in one of three episodes only."""
+
+        episodes = 0
+
+        def reset(self, **arguments: Any) -> tuple[Any, dict[str, Any]]:
+            self.episodes += 1
+            return super().reset(**arguments)
+
+        def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+            *rest, _ = super().step(action)
+            return *rest, {"is_success": True} if self.episodes % 3 == 1 else {}
+
+    made = runner(Lucky, num_envs=1, max_episode_steps=6)
+    made.sample(num_episodes=6)
+    assert made.get_metrics()[SUCCESS_LAST].peek() == pytest.approx(1 / 3)
+    made.set_state(made.get_state())
+    (episode,) = made.sample(num_episodes=1)
+    assert episode.successes is not None
+    made.sample(num_episodes=1)
+    assert made.get_metrics()[SUCCESS_LAST].peek() == 0.5

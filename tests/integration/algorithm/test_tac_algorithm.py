@@ -406,7 +406,7 @@ def test_q_bias_equals_its_definition() -> None:
     module.value_target[-1].bias.data.fill_(-7.0)
     learner.metrics.reduce()
     episodes = algo.env_runner.sample(random_actions=True)
-    learner.diagnose(episodes)
+    learner.diagnose(episodes, None)
     returns = [sum(r * 0.9**t for t, r in enumerate(e.rewards)) - 7 * 0.9**50 for e in episodes]
     logged = learner.metrics.peek(("default_policy", names.Q_BIAS))
     assert logged == pytest.approx(3.0 - np.mean(returns), rel=1e-5)
@@ -486,7 +486,7 @@ def test_the_bound_on_fresh_episodes_is_taken_over_all_of_them(tmp_path: Path) -
     ends = np.cumsum([0, *steps])
     for i, (begin, end) in enumerate(itertools.pairwise(ends)):
         columns = (held["actions"][begin:end], held["rewards"][begin:end], held["terminated"][i])
-        learner.diagnose([Trajectory(held["frames"][begin + i : end + i + 1], *columns)])
+        learner.diagnose([Trajectory(held["frames"][begin + i : end + i + 1], *columns)], None)
     algo.save_to_path(tmp_path / "checkpoint")
     resumed.restore_from_path(tmp_path / "checkpoint")
     taken = learner._music.metrics()

@@ -340,3 +340,13 @@ def test_episodes_end_where_compute_terminated_is_true(
         return
     with pytest.raises(BadNumberError, match=f"{found}: .*if episodes continue where"):
         recording.finish(terminated=terminated)
+
+
+def test_a_step_without_success_is_none_if_another_step_reports_one() -> None:
+    recording = Recording(LAYOUT, name="Env-v0", success=("done", None))
+    recording.see(observation())
+    for info in ({}, {"done": True}, {}):
+        take(recording, observation(), **info)
+    successes = recording.finish(terminated=False).successes
+    assert successes is not None
+    assert successes.tolist() == [False, True, False]

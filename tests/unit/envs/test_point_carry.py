@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+import pytest
 from gymnasium.utils.env_checker import check_env
 
+from music_rllib.envs.goal_functions import goal_reward_of, moved_distance_of
 from music_rllib.envs.make import make_env
+from music_rllib.envs.point_carry import PointCarry
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 
 TASK = BUILT_IN_TASKS["PointCarry"]
@@ -38,3 +43,16 @@ def test_the_object_moves_only_when_carried_and_success_is_the_reward() -> None:
         ]
         assert np.array_equal(*split)
         assert np.array_equal(split[1], observation["achieved_goal"])
+
+
+@pytest.mark.parametrize("width", [0.05, 1.0])
+def test_a_reward_that_is_flat_near_the_goal_is_dense(width: float) -> None:
+    class Smooth(PointCarry):
+        def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
+            distance = np.linalg.norm(np.asarray(achieved_goal) - desired_goal, axis=-1)
+            return np.exp(-((distance / width) ** 2)) - 1
+
+    sparse, smooth = PointCarry(), Smooth()
+    assert moved_distance_of(sparse, goal_reward_of(sparse)) is None
+    with pytest.raises(ValueError, match="has dense rewards and no distance_threshold"):
+        moved_distance_of(smooth, goal_reward_of(smooth))

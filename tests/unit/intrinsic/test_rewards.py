@@ -429,6 +429,17 @@ def test_measuring_fresh_episodes_changes_nothing(name: str) -> None:
     learner = made(name)
     learner.learn(batch(), 1)
     before = learner.weights()
-    learner.observe(batch(seed=1), [])
+    learner.observe(batch(seed=1), None)
     for key, array in learner.weights().items():
         np.testing.assert_array_equal(array, before[key])
+
+
+@pytest.mark.parametrize("name", sorted(set(BUILT_IN) - {"random"}))
+def test_a_bonus_that_depends_on_its_minibatch_says_so(name: str) -> None:
+    reward = make_reward(IntrinsicSettings(reward=name), SIZES, 0)
+    whole = batch()
+    names = ("states", "actions", "followers", "goals", "stored")
+    part = whole._replace(**{name: getattr(whole, name)[:8] for name in names})
+    with torch.no_grad():
+        depends = not torch.allclose(reward.bonus(whole)[:8], reward.bonus(part), atol=1e-5)
+    assert reward.by_minibatch == depends
