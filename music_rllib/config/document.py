@@ -278,11 +278,14 @@ def lay_overrides(document: Document, overrides: Mapping[str, Any]) -> None:
             layers = _layers_of_tasks(stage)
             if setting[0] == "per_task":
                 setting, layers = setting[2:], []
+            _check_whole(document, place, setting, key)
             if setting and setting[0] in LAYER_KEYS:
                 is_group = setting[-1] in SECTIONS and isinstance(value, dict)
                 for name, inner in value.items() if is_group else [("", value)]:
                     one = (*setting, name) if name else setting
-                    _check_not_varied(stage, ".".join(map(str, one)), inner, key)
+                    for each in _stages(document):
+                        dotted, of = ".".join(map(str, one)), str(stage.get("name"))
+                        _check_not_varied(each, dotted, inner, key, of)
                     _remove(one, *layers)
         document.put(place, value)
 
@@ -302,6 +305,18 @@ def _layers_of_tasks(stage: Mapping[str, Any]) -> list[Any]:
     return [*tasks.values()] if isinstance(tasks, dict) else []
 
 
+def _check_whole(document: Document, place: KeyPath, setting: KeyPath, typed: str) -> None:
+    """Refuse a value inside of a setting that is not written at its place, where it would be alone.
+
+    The argument `typed` sets `place`, the dotted `setting` of a stage or of one of its tasks.
+    """
+    inside = len(setting) > 2 and setting[0] in LAYER_KEYS
+    above = place[: len(place) - len(setting) + 2]
+    if inside and not isinstance(find(document.data, above), dict):
+        whole = typed.removesuffix("." + ".".join(map(str, setting[2:])))
+        raise _refusal(f"{typed} must be a whole setting, {whole}={{...}}, got a part of it")
+
+
 def _remove(place: KeyPath, *layers: Any) -> None:
     """Remove a setting that an override replaces."""
     for layer in layers:
@@ -309,11 +324,19 @@ def _remove(place: KeyPath, *layers: Any) -> None:
             group.pop(place[-1], None)
 
 
-def _check_not_varied(stage: Mapping[str, Any], key: str, value: Any, typed: str) -> None:
-    """Refuse the setting `key` of the argument `typed` if the stage varies it."""
+def _check_not_varied(
+    stage: Mapping[str, Any], key: str, value: Any, typed: str, of: str | None = None
+) -> None:
+    """Refuse the setting `key` of the argument `typed` if the stage varies it.
+
+    `of` is the stage that the argument names; None: all stages. A search may vary settings of the
+    stage that its own starts from, as `STAGE:setting`.
+    """
     for group in (("grid",), ("search", "space"), ("search", "compare")):
         varied = find(stage, group)
         for name, choices in varied.items() if isinstance(varied, dict) else ():
+            if of is not None and (str(name).rpartition(":")[0] or stage.get("name")) != of:
+                continue
             choices = choices.get("choice") if isinstance(choices, dict) else choices
             choices = choices if isinstance(choices, list) else []
             settings = varied_by(str(name).rpartition(":")[2], choices)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from typing import Any, NamedTuple
 
 from music_rllib.config.run_settings import RunSettings
@@ -24,6 +24,7 @@ from music_rllib.experiment.sweep_files import (
     PLAN,
     SweepLocation,
     as_json,
+    sweeps_in,
 )
 from music_rllib.names import in_runs
 from music_rllib.redaction import redact, without_secrets
@@ -45,17 +46,37 @@ def keep_record(sweep: OpenSweep) -> None:
     unchanged = _unchanged_plan(sweep, configuration)
     with contextlib.suppress(StorageError):  # a damaged record is replaced
         sweep.earlier[:] = unchanged["earlier"] if unchanged else _earlier_runs(sweep)
-    location.keep(CONFIG, configuration)
     keeps_trials = unchanged is not None and sweep.plan.searched and not sweep.plan.trials
+    # The plan first: the earlier one may have trials of stages that the configuration lacks.
     if unchanged is None or not keeps_trials:
         location.keep(PLAN, as_json(plan_document(sweep)))
     elif sweep.removed:  # the record has trials that the plan does not have yet
         location.keep(PLAN, as_json({**unchanged, **_retrained(sweep)}))
+    location.keep(CONFIG, configuration)
 
 
 def _retrained(sweep: OpenSweep) -> dict[str, list[str]]:
     """The nodes to train again: a search that is stopped before must know them, too."""
     return {"retrain": sorted(sweep.removed)} if sweep.removed else {}
+
+
+def record_retraining(storage: str, keys: Collection[str]) -> None:
+    """Name runs in the plans of all sweeps that have them, before these runs are deleted.
+
+    A search does not ask again for the runs of its ended trials, unless its plan names them.
+
+    Raises:
+        StorageError: A plan can't be written.
+    """
+    for location in sweeps_in(storage) if keys else ():
+        try:
+            plan = location.read(PLAN)
+        except StorageError:  # a damaged plan names no trials
+            continue
+        nodes = (*plan["nodes"], *plan.get("earlier", ()))
+        if own := {node["key"] for node in nodes}.intersection(keys):
+            retrain = sorted(own.union(plan.get("retrain", ())))
+            location.keep(PLAN, as_json({**plan, "retrain": retrain}))
 
 
 def plan_document(sweep: OpenSweep) -> dict[str, Any]:
@@ -78,6 +99,9 @@ def configuration_of(config: SweepConfig) -> dict[str, Any]:
     if uri := (document.get("mlflow") or {}).get("tracking_uri"):
         document["mlflow"]["tracking_uri"] = database_url(uri)
     for stage, resolved in zip(document["stages"], config.stages, strict=True):
+        search = stage.get("search") or {}
+        if str(search.get("storage")).startswith("sqlite:"):  # its path may be relative
+            search["storage"] = database_url(search["storage"])
         if resolved.source and resolved.source.checkpoint:
             stage["init_from"]["checkpoint"] = f"{IN_STORAGE}{resolved.source.checkpoint.key}"
     return document

@@ -128,8 +128,13 @@ def searches_of(location: SweepLocation, config: SweepConfig) -> list[dict[str, 
     try:
         now = {search["stage"]: search for search in state["searches"]}
         ended = {search["stage"]: search for search in location.read(sweep_files.SEARCH) or ()}
-        unfinished = {stage: search for stage, search in now.items() if not search["complete"]}
-        known = now | ended | unfinished
+        # A driver that was killed has not replaced `search.json`.
+        newer = {
+            stage: search
+            for stage, search in now.items()
+            if not search["complete"] or _trials(search) != _trials(ended.get(stage, search))
+        }
+        known = now | ended | newer
         return checked_searches(
             [known[stage.name] for stage in config.stages if stage.search and stage.name in known]
         )
@@ -138,6 +143,13 @@ def searches_of(location: SweepLocation, config: SweepConfig) -> list[dict[str, 
             f"{location.place}/{sweep_files.SEARCH} must hold the results of searches as "
             f"the driver writes them: {reason_of(error)}"
         ) from error
+
+
+def _trials(search: Mapping[str, Any]) -> list[Any]:
+    """The studies of a search with their numbers of trials, and its ranked trials."""
+    studies = [(arm["study"], len(arm["trials"])) for arm in search["arms"]]
+    ranked = [row for row in search["ranking"] if "failure" not in row]
+    return [*studies, sorted((row["trial"], str(row["values"])) for row in ranked)]
 
 
 _NOT_STARTED: dict[str, Any] = {

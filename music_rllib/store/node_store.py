@@ -133,8 +133,8 @@ class NodeStore(SealedFolders):
     def files(self, key: str) -> Iterator[Path]:
         """Yield a finished node's folder, verified; of a bucket, a temporary copy."""
         if self._root.is_local:
-            self.check(key)
-            yield Path(self.path(key))
+            # A storage that was copied from a bucket has a prefix.
+            yield Path(self.path(key), self.check(key).prefix)
             return
         with TemporaryDirectory(prefix="music-rllib-node-") as copy:
             self.fetch(key, Path(copy))
@@ -147,9 +147,9 @@ class NodeStore(SealedFolders):
         return stack.enter_context(self.files(key))
 
     def verify(self, key: str) -> None:
-        """Check that a finished node matches its manifest."""
+        """Check that a finished node matches its manifest, as `damage` does."""
         try:
-            self.check(key)
+            self._check(key, None)
         except DamagedError as error:
             raise DamagedError(f"{error}; {TRAIN_AGAIN}") from error
 

@@ -20,7 +20,7 @@ from music_rllib.command_line import console_for, how_to_continue, print_json
 from music_rllib.config.load import load_config, warnings_of
 from music_rllib.config.schema import MlflowSettings, SweepConfig
 from music_rllib.envs.tasks import search_in
-from music_rllib.errors import BadInputError, is_stop
+from music_rllib.errors import FAILED, BadInputError, is_stop
 from music_rllib.experiment.open_sweep import (
     OpenSweep,
     accept_environments,
@@ -46,7 +46,7 @@ from music_rllib.runtime.machine import (
 )
 from music_rllib.runtime.process import early, without_collections
 from music_rllib.store.patience import be_patient
-from music_rllib.store.storage import check_storage, is_remote, resolve_storage
+from music_rllib.store.storage import StorageError, check_storage, is_remote, resolve_storage
 from music_rllib.sweep import preflight
 from music_rllib.sweep.preflight import check_demand
 from music_rllib.sweep.views.plan import cluster_answer, plan_answer, plan_view
@@ -126,7 +126,7 @@ def run(
     """
     # `plan` needs none of it.
     with without_collections():
-        from music_rllib.experiment.record import keep_record
+        from music_rllib.experiment.record import keep_record, record_retraining
         from music_rllib.sweep.driver_lock import alone, driving
         from music_rllib.sweep.execution import compute_and_report, open_tracker
 
@@ -159,22 +159,28 @@ def run(
                     keys += [node["key"] for node in started]
                     clean.check_not_in_use(opened.location, keys)
                 opened = reopened(opened)  # another command may have deleted runs
+                preflight.check_searches(opened)  # nothing is deleted before
+                retrained = [*(run.key for run in again), *(node["key"] for node in started)]
+                record_retraining(opened.storage, {*retrained, *opened.damaged})
                 remove_damaged(opened, warn)
                 opened = accept_environments(remove_runs(opened, again, warn), kept, warn)
                 if started:
                     clean.remove_started(opened.store, started, warn)
                 _check(opened)
                 tracker = stack.enter_context(open_tracker(opened))
-                retrained = [*(run.key for run in again), *(node["key"] for node in started)]
                 for key in (*retrained, *opened.damaged):
                     tracker.forget(key)
                 keep_record(opened)
                 has_begun = True  # what is to be retrained is recorded
                 plans = _record_analysis_plan(console, opened)
                 shares = bool(drivers.others())
-            code = compute_and_report(
-                console, opened, tracker, plans, drivers, wait_minutes, shares=shares
-            )
+            try:
+                code = compute_and_report(
+                    console, opened, tracker, plans, drivers, wait_minutes, shares=shares
+                )
+            except StorageError as error:  # no longer bad input
+                error.exit_code = FAILED
+                raise
         if as_json:
             print_json(opened.location.read(STATE) or {})
     except (KeyboardInterrupt, SystemExit) as stopped:

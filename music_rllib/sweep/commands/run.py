@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from music_rllib.command_line import Json, time_option
+from music_rllib.errors import BadInputError
 from music_rllib.sweep.commands import Place, Storage
 
 RUN_EXAMPLES = """\
@@ -195,8 +196,16 @@ def resume(
     from music_rllib.experiment.sweep_files import find_sweep
     from music_rllib.sweep import driver
 
+    location = find_sweep(sweep, storage)
+    config = location.config(seeds)
+    if config.name != location.name:  # its folder was renamed or copied
+        raise BadInputError(
+            f"SWEEP must be in a folder with its name, {config.name}, got {location.place}: rename "
+            f"the folder, or give 'run' the sweep's file and --name {location.name}, which reuses "
+            "finished runs"
+        )
     return driver.run(
-        find_sweep(sweep, storage).config(seeds),
+        config,
         accept_changes=accept_changes,
         retrain=retrain or (),
         keep_runs=keep_runs,

@@ -23,22 +23,27 @@ from optuna.exceptions import StorageInternalError
 from optuna.trial import TrialState
 
 from music_rllib import names
+from music_rllib.config.load import load_config
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.search import FINAL_SEED
 from music_rllib.config.tac_settings import LearnedAlpha
+from music_rllib.errors import BadInputError
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.open_sweep import OpenSweep, decide, found_runs, remove_runs
+from music_rllib.experiment.plan import Node
 from music_rllib.experiment.record import changes_since, keep_record
 from music_rllib.experiment.scheduler import Status
 from music_rllib.program import main
 from music_rllib.results.analysis import stage_scopes
 from music_rllib.results.conditions import find_stages
-from music_rllib.results.read import read_sweep
+from music_rllib.results.read import read_sweep, searches_of
 from music_rllib.search import study as study_module
 from music_rllib.search.outcome import outcome
+from music_rllib.sweep import driver as driver_module
 from music_rllib.sweep.listeners.state_file import StateFile
 from tests.played_search import SPACE, Document, Driver, document, points, searched, success
 from tests.processes import fresh
+from tests.sweep_files import loaded
 
 
 @pytest.fixture
@@ -826,3 +831,86 @@ def test_a_database_that_does_not_answer_is_refused(tmp_path: Path) -> None:
     search = {"storage": "postgresql://me@127.0.0.1:9/studies"}
     with pytest.raises(RuntimeError, match=r"search.storage must be a database that can be used"):
         Driver(tmp_path, document(search))
+
+
+# --- retraining ----------------------------------------------------------------------------------
+
+
+class KilledError(BaseException):
+    """Ends a driver at once, as `kill -9` does."""
+
+
+def killed(*_: Any) -> None:
+    raise KilledError
+
+
+def one_trial(folder: Path) -> tuple[Document, Driver, Node]:
+    """A recorded search with one trial, whose run has ended."""
+    content = document({"trials": 1}, seeds=[0])
+    first = Driver(folder, content)
+    first.play()
+    keep_record(first.sweep)
+    first.controller.stop()
+    (node,) = (node for node in first.sweep.plan.nodes if node.part)
+    return content, first, node
+
+
+def test_a_run_to_retrain_is_recorded_before_it_is_deleted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content, first, node = one_trial(tmp_path)
+    config = load_config(tmp_path / "sweep.yaml", storage=str(tmp_path / "results"))
+    with monkeypatch.context() as patch:
+        patch.setattr(driver_module, "_check", killed)
+        with pytest.raises(KilledError):
+            driver_module.run(config, retrain=[node.label])
+    assert not first.sweep.store.is_finished(node.key)
+    again = Driver(tmp_path, content)
+    again.play()
+    assert again.computed == [f"{node.key}/None"]
+
+
+def test_nothing_is_deleted_if_the_study_cannot_be_opened(tmp_path: Path) -> None:
+    _, first, node = one_trial(tmp_path)
+    (tmp_path / "results" / "s" / "study.db").write_bytes(b"x" * 4096)
+    config = load_config(tmp_path / "sweep.yaml", storage=str(tmp_path / "results"))
+    with pytest.raises(BadInputError, match=r"search\.storage must be a database"):
+        driver_module.run(config, retrain=[node.label])
+    assert first.sweep.store.is_finished(node.key)
+
+
+def test_trials_of_another_sweep_that_start_from_a_retrained_run_are_trained_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content, first, node = one_trial(tmp_path)
+    plain = document({}, name="plain", seeds=[0])
+    plain["stages"] = plain["stages"][:1]
+    config = loaded(tmp_path, plain, storage=str(tmp_path / "results"))
+    with monkeypatch.context() as patch:
+        patch.setattr(driver_module, "_check", killed)
+        with pytest.raises(KilledError):
+            driver_module.run(config, retrain=["pretrain"])
+    again = Driver(tmp_path, content)
+    again.play()
+    assert len(again.computed) == 2
+    assert first.sweep.store.is_finished(node.key)
+
+
+def test_an_extended_search_that_was_killed_before_its_record_shows_its_new_trials(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for trials in (2, 3):
+        driver = Driver(tmp_path, document({"trials": trials}, seeds=[0]))
+        keep_record(driver.sweep)
+        driver.play()
+        found = functools.partial(outcome, driver.controller, thorough=False)
+        with StateFile(driver.sweep) as state:
+            monkeypatch.setattr(state, "searches", found)
+            state.tick()
+            state._update()
+            state._write()
+        if trials == 2:
+            driver.sweep.location.keep(sweep_files.SEARCH, sweep_files.as_json(found()))
+        driver.controller.stop()
+    (shown,) = searches_of(driver.sweep.location, driver.sweep.config)
+    assert len(shown["arms"][0]["trials"]) == 3

@@ -282,3 +282,44 @@ def test_an_unknown_key_of_a_grid_is_one_mistake(tmp_path: Path) -> None:
         "sweep.yaml:3: stages.a.grid.tac.gamma[1] must be < 1, got 1.5",
         "sweep.yaml:3: stages.a.grid.tac.gamma[2] must be < 1, got 2",
     ]
+
+
+OF_SOURCE = """
+name: mine
+tasks: [FetchPush]
+stages:
+  - {name: before, variant: music-u}
+  - name: after
+    variant: music-r
+    init_from: before
+    search: {space: {"before:tac.lr": {choice: [0.001, 0.002]}}, trials: 2}
+"""
+
+
+def test_a_search_varies_a_setting_of_its_source_only(tmp_path: Path) -> None:
+    refused = mistake(tmp_path, "stages.before.tac.lr=0.01", text=OF_SOURCE)
+    assert "stages.after.search.space.before:tac.lr varies it" in refused
+    config = load(tmp_path, "stages.after.tac.lr=0.01", text=OF_SOURCE)
+    assert config.stage("after").points[0].runs["FetchPush"].tac.lr == 0.01
+    with pytest.raises(ConfigError):
+        load(tmp_path, "tac.lr=0.01", text=OF_SOURCE)
+
+
+OWN = "{reward: rnd, settings: {hidden: 32, features: 8}}"
+
+
+def test_a_part_of_a_setting_keeps_the_others_or_is_refused(tmp_path: Path) -> None:
+    text = "name: s\ntasks: [FetchPush]\nstages:\n  - {name: a, variant: tac"
+    within = f"{text}, intrinsic: {OWN}}}\n"
+    config = load(tmp_path, "stages.a.intrinsic.settings.hidden=64", text=within)
+    settings = config.stage("a").points[0].runs["FetchPush"].intrinsic.settings
+    assert dict(settings) == {"hidden": 64, "features": 8}
+    above = f"{text}}}\ndefaults: {{intrinsic: {OWN}}}\n"
+    refused = mistake(tmp_path, "stages.a.intrinsic.settings.hidden=64", text=above)
+    assert "must be a whole setting, stages.a.intrinsic.settings={...}, got a part" in refused
+
+
+def test_a_reward_in_a_group_of_a_grid_is_no_secret(tmp_path: Path) -> None:
+    grid = "{intrinsic: [{reward: 'my_token:Reward'}, {reward: rnd}]}"
+    text = f"name: s\ntasks: [FetchPush]\nstages: [{{name: a, variant: tac, grid: {grid}}}]\n"
+    assert len(load(tmp_path, text=text).stage("a").points) == 2

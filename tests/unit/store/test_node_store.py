@@ -1,6 +1,7 @@
 """The node store on a disk and in a bucket."""
 
 import errno
+import json
 import os
 import shutil
 import subprocess
@@ -501,3 +502,29 @@ def test_the_reports_of_an_interrupted_run_are_those_of_the_newest_sound_checkpo
     assert work.lines() == b"2000"
     work.folder.write(f"{work.names()[-1]}/manifest.json", b"damage")
     assert work.lines() == b"1000"
+
+
+def test_a_worker_refuses_a_result_that_contradicts_its_history(
+    tmp_path: Path, produced: Path
+) -> None:
+    store = local_store(tmp_path)
+    store.publish(KEY, produced, RESULT)
+    manifest = Path(store.path(KEY), "manifest.json")
+    manifest.write_text(manifest.read_text().replace("0.5", "0.9"))
+    assert list(store.damage([KEY])) == [KEY]
+    with pytest.raises(DamagedError, match="--retrain-damaged"):
+        store.verify(KEY)
+
+
+def test_the_files_of_a_bucket_that_was_copied_to_a_disk(tmp_path: Path, produced: Path) -> None:
+    store = local_store(tmp_path)
+    store.publish(KEY, produced, RESULT)
+    node = Path(store.path(KEY))
+    prefix = "0" * 32 + "/"
+    (node / prefix).mkdir()
+    for name in ("handoff", HISTORY):
+        (node / name).rename(node / prefix / name)
+    manifest = node / "manifest.json"
+    manifest.write_text(json.dumps(json.loads(manifest.read_text()) | {"prefix": prefix}))
+    with store.files(KEY) as folder:
+        assert (folder / "handoff" / "w.bin").read_bytes() == b"weights"

@@ -25,6 +25,7 @@ from rich.console import Console
 
 from music_rllib import names
 from music_rllib.config.load import load_config
+from music_rllib.errors import BadInputError
 from music_rllib.experiment import open_sweep as open_sweep_module
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.open_sweep import (
@@ -32,6 +33,7 @@ from music_rllib.experiment.open_sweep import (
     changed_text,
     continued_runs_text,
     found_runs,
+    open_started,
     open_sweep,
     remove_damaged,
 )
@@ -51,13 +53,15 @@ from music_rllib.store import node_store
 from music_rllib.store import storage as storage_module
 from music_rllib.store.history import HISTORY, Report, RunResult, to_json_lines
 from music_rllib.store.lease import Lease, LeaseFile
-from music_rllib.store.storage import DamagedError, StorageFolder
+from music_rllib.store.storage import DamagedError, StorageError, StorageFolder
 from music_rllib.sweep import clean, driver, driver_lock, execution
+from music_rllib.sweep.commands.run import resume
 from music_rllib.sweep.export import sweep_of_run
 from music_rllib.sweep.listeners.state_file import StateFile
 from music_rllib.sweep.preflight import import_checkpoints
 from music_rllib.sweep.views.results import console_table
 from tests.handoffs import music_u, write_estimator
+from tests.kept_sweep import kept_sweep
 from tests.sweep_files import loaded
 
 REPOSITORY = Path(__file__).parents[3]
@@ -1094,3 +1098,97 @@ def test_plan_names_only_new_hypotheses_about_stages_with_results(
     assert other not in first
     assert said(one, other, question="Why?") == "", "an earlier version had both"
     assert one in said(one, other, margin=0.2), "that is another test of it"
+
+
+def test_resume_refuses_a_folder_that_was_renamed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started: list[str] = []
+    monkeypatch.setattr(driver, "run", lambda config, **_: started.append(config.name))
+    folder = kept_sweep(tmp_path)
+    resume(str(folder))
+    folder.rename(tmp_path / "t")
+    with pytest.raises(BadInputError, match=f"folder with its name, s, got {tmp_path / 't'}: ren"):
+        resume(str(tmp_path / "t"))
+    assert started == ["s"]
+
+
+def test_a_relative_database_of_a_search_is_recorded_with_its_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    space = {"tac.lr": {"choice": [0.001, 0.002]}}
+    search = {"space": space, "trials": 2, "storage": "sqlite:///q.db"}
+    folder = kept_sweep(tmp_path, stages=[{"name": "a", "variant": "tac", "search": search}])
+    (stage,) = sweep_files.find_sweep(str(folder), None).config().stages
+    assert stage.search is not None
+    assert stage.search.storage == f"sqlite:///{tmp_path}/q.db"
+
+
+def test_a_record_of_which_only_a_part_was_written_can_be_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def opened(name: str) -> OpenSweep:
+        search = {"space": {"tac.lr": {"choice": [0.001, 0.002]}}, "trials": 2}
+        stage = {"name": name, "variant": "tac", "search": search}
+        config = loaded(tmp_path, {"name": "s", "tasks": ["FetchReach"], "stages": [stage]})
+        return open_sweep(config, make_plan(config), str(tmp_path / "results"))
+
+    first = opened("tune")
+    first.plan.add_trial("tune", 0, {"tac.lr": 0.001}, [0], "trial0")
+    keep_record(first)
+    keep = sweep_files.SweepLocation.keep
+    written: list[Any] = []
+
+    def full(location: sweep_files.SweepLocation, file: Any, text: Any) -> None:
+        if written:
+            raise StorageError("must be writable: No space left on device")
+        written.append(file)
+        keep(location, file, text)
+
+    monkeypatch.setattr(sweep_files.SweepLocation, "keep", full)
+    with pytest.raises(StorageError):
+        keep_record(opened("search"))
+    open_started(first.location)
+
+
+def test_compare_refuses_a_metric_that_only_another_stage_has(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    first, second = ({"name": name, "variant": "tac"} for name in ("a", "b"))
+    sweep = opened(storage, tmp_path, stages=[first, second | {"tac": {"alpha": 0.1}}], seeds=[0])
+    with StateFile(sweep) as state_file:
+        for node in sweep.plan.nodes:
+            metric = names.EVAL_DISPLACEMENT if node.stage == "a" else names.EVAL_SUCCESS
+            finish(sweep, state_file, node, 0.5, tmp_path / "made", metric)
+        state_file.end("finished")
+    arguments = ["--stage", "b", "--metric", names.EVAL_DISPLACEMENT]
+    said = program("compare", f"{storage}/mine", *arguments)
+    assert said.code == 2
+    assert f"{names.EVAL_SUCCESS} in stage b, got '{names.EVAL_DISPLACEMENT}'" in said.errors
+
+
+def test_stop_leaves_a_driver_alone_that_writes_its_report(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    sweep = opened(storage, tmp_path)
+    with driver_lock.driving(sweep.location) as drivers:
+        with StateFile(sweep, drivers.stop_before) as state_file:
+            state_file.end("finished")
+        asked = program("stop", f"{storage}/mine", "--wait", "0", "--json").document
+    assert asked == {"sweep": "mine", "was_running": False, "state": "finished"}
+    assert sweep.location.read(sweep_files.STOP) is None
+
+
+@pytest.mark.parametrize("command", ["evaluate", "serve"])
+def test_an_empty_storage_is_refused(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: Program
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    said = program(command, "q=1/seed0", "--storage", "")
+    assert (said.code, said.errors) == (2, "error: --storage must not be empty, got ''\n")
+
+
+def test_the_last_line_of_a_watch_ends(storage: str, tmp_path: Path, program: Program) -> None:
+    played(storage, tmp_path)
+    assert program("status", f"{storage}/mine", "--watch").output.endswith("\n")
