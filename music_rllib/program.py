@@ -20,7 +20,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from music_rllib import __version__
 from music_rllib.command_line import PROGRAM
-from music_rllib.errors import BadInputError
+from music_rllib.errors import FAILED, BadInputError
 from music_rllib.redaction import for_people
 from music_rllib.report import cli as report
 from music_rllib.runtime.quiet import prepare_environment, quiet_third_parties
@@ -88,10 +88,35 @@ class Command(_KeepsExamples, TyperCommand):
         except KeyboardInterrupt:
             code = 128 + signal.SIGINT
         except BrokenPipeError:
-            # The reader has closed the pipe (`| head`); this avoids a second error at exit.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            _discard_output()  # the reader has closed the pipe (`| head`)
             code = 0
+        except OSError:
+            code = _end_output()
+            if not code:
+                raise
+        else:
+            code = code or _end_output()
         raise typer.Exit(int(code or 0))
+
+
+def _end_output() -> int:
+    """Write what standard output still holds; `FAILED` if that is impossible (a full disk).
+
+    Python itself would do it at its end, print an ignored exception, and exit with 120.
+    """
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        _discard_output()
+        if not isinstance(error, BrokenPipeError):
+            print(f"error: the output can't be written: {error.strerror}", file=sys.stderr)
+            return FAILED
+    return 0
+
+
+def _discard_output() -> None:
+    """Avoid a second error at the end of the process."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class Group(_KeepsExamples, TyperGroup):

@@ -309,6 +309,8 @@ def find_policy(wanted: str, storage: str) -> str:
     """
     if not wanted:
         raise PolicyError("the run must not be empty, got ''")
+    if not storage:  # a Path of '' would be the current folder
+        raise PolicyError("--storage must not be empty, got ''")
     if "://" in wanted or wanted.startswith(("models:/", "runs:/")) or os.path.lexists(wanted):
         return wanted
     storage = resolve_storage(storage)[0]

@@ -135,6 +135,27 @@ except BrokenPipeError:  # `Command` ends with 0
     fresh("-c", code, code=7)
 
 
+@pytest.mark.parametrize(
+    ("output", "code", "error"),
+    [
+        ("a reader that ended", 0, ""),
+        ("/dev/full", 1, "error: the output can't be written: No space left on device\n"),
+    ],
+)
+def test_output_that_is_written_last_can_fail(output: str, code: int, error: str) -> None:
+    reader, sink = os.pipe()
+    os.close(reader)
+    if output == "/dev/full":
+        os.dup2(os.open(output, os.O_WRONLY), sink)
+    buffered = {name: text for name, text in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    command = [sys.executable, "-m", "music_rllib", "presets", "--json"]
+    done = subprocess.run(
+        command, cwd=REPOSITORY, env=buffered, stdout=sink, stderr=subprocess.PIPE, text=True
+    )
+    os.close(sink)
+    assert (done.returncode, done.stderr) == (code, error)
+
+
 @pytest.mark.parametrize("closed", ["1", "2"])
 def test_output_may_be_closed(closed: str) -> None:
     command = f"exec '{sys.executable}' -m music_rllib presets --json {closed}>&-"

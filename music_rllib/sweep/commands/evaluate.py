@@ -75,8 +75,6 @@ def evaluate(
     from music_rllib.policy.rollout import open_task, play
     from music_rllib.policy.video import check_video_file, film, write_video
 
-    if not storage:
-        raise BadInputError("--storage must not be empty, got ''")
     if video is not None:
         check_video_file(video)
     place = find_policy(run, storage)

@@ -68,6 +68,8 @@ def status(
                 time.sleep(max(interval, 0.2))
                 state = state_of(location)
                 live.update(status_view(state, _labels(location)), refresh=True)
+        if not console.is_terminal:  # where `Live` leaves out the last line's end
+            console.print()
     return FAILED if state.get("damaged") else 0
 
 
@@ -140,8 +142,16 @@ def stop(
     name = location.name
     console = console_for(as_json=json)
 
-    def runs() -> bool:  # a driver that is starting has no state yet
-        return bool(drivers_of(location)) or state_of(location)["state"] == "running"
+    def runs() -> bool:
+        """Whether a driver computes runs, or is starting and has no state yet."""
+        state = location.read(sweep_files.STATE)
+        if sweep_files.is_alive(state):
+            return True
+        # The driver that has ended its state only sends records to MLflow or writes the report.
+        driver = {} if state is None else state["driver"]
+        ended = tuple(driver.get(key) for key in ("machine", "pid", "process_started"))
+        drivers = drivers_of(location)
+        return any((one.machine, one.pid, one.process_started) != ended for one in drivers)
 
     deadline = time.monotonic() + wait
     is_running = was_running = runs()
