@@ -29,6 +29,7 @@ NOT_IN_THE_PICTURE = (
     "equal-entropy",
     "equal-entropy-fixed",
     "equal-entropy-slide",
+    "joint-pick",
     "claims-pick-and-place",
     "claims-slide",
 )

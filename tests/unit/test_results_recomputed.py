@@ -32,7 +32,8 @@ STUDIES = {  # export and compared stage
     ("FetchPush", f"{AT} a learned α, MUSIC-r"): ("equal-entropy", "music-r"),
     ("FetchPush", JOINT): ("joint-her", "her"),
     ("FetchPush", MUSIC): ("claims-push", "music-r"),
-    ("FetchPickAndPlace", "joint entropy, MUSIC-r"): ("joint-pick", "music-r"),
+    ("FetchPickAndPlace", "joint entropy, MUSIC-r"): ("joint-pick-fresh", "music-r"),
+    ("FetchPickAndPlace", "joint entropy, MUSIC-r, first study"): ("joint-pick", "music-r"),
     ("FetchPickAndPlace", MUSIC): ("claims-pick-and-place", "music-r"),
     ("FetchSlide", "joint entropy, MUSIC-r"): ("joint-slide", "music-r"),
     ("FetchSlide", f"{AT} a fixed α, MUSIC-r"): ("equal-entropy-slide", "music-r"),
@@ -42,7 +43,8 @@ TOTALS = {"claims-pick-and-place": 200_000, "joint-music": 30_000}
 """Steps with pretraining at which MUSIC-r is compared with HER alone."""
 COUNTED = {
     **dict.fromkeys(("joint-music", "equal-entropy-fixed", "equal-entropy"), 30_000),
-    **dict.fromkeys(("joint-pick", "pick-and-place-in-80000-steps"), 80_000),
+    **dict.fromkeys(("joint-pick-fresh", "joint-pick"), 80_000),
+    "pick-and-place-in-80000-steps": 80_000,
     **dict.fromkeys(("joint-slide", "equal-entropy-slide"), 200_000),
 }
 """Steps of the studies whose metric counts the pretraining."""
@@ -51,6 +53,7 @@ IN_DETAIL = {
     "equal-entropy": "**With a learned α**",
     "joint-her": "## FetchPush in the joint form, HER alone\n",
     "claims-push": "## FetchPush\n",
+    "joint-pick": "**The first study**",
     "claims-pick-and-place": "## FetchPickAndPlace\n",
     "claims-slide": "## FetchSlide\n",
     "equal-entropy-slide": "## FetchSlide at equal entropy\n",

@@ -36,7 +36,8 @@ SETTINGS = {  # <q,q> is the α that these q share
         "{steps} environment steps after {before} of MUSIC-u at q = 1, with HER; {seeds} fresh "
         "seeds; α = <1,1.5,2> for each q.",
     ),
-    "joint-pick": (
+    "joint-pick": ("A first study of {seeds} seeds",),
+    "joint-pick-fresh": (
         "{steps} environment steps after {before} of MUSIC-u at q = 1, with `preset: "
         "sample-efficient`; {seeds} fresh seeds; α = <1>, <1.5> and <2> for q = 1, 1.5 and 2",
     ),
