@@ -457,20 +457,6 @@ def test_every_figure_of_the_readme_is_on_the_page() -> None:
         assert f"| {percent} [" in PAGE or f"{percent} (95% CI" in " ".join(PAGE.split())
 
 
-def test_music_r_on_30_seeds_of_three_studies() -> None:
-    studies = ("pick-and-place-in-80000-steps", "joint-pick", "intrinsic-rewards-pick")
-    own = [(study, runs(study, "music-r").query("q == '1'").run) for study in studies]
-    ends = [np.array([curve(study, run, MEAN)[1][-1] for run in of]) for study, of in own]
-    finals = np.concatenate(ends)
-    low, high = stats.t.interval(0.95, len(finals) - 1, finals.mean(), stats.sem(finals))
-    text = (
-        f"MUSIC-r with the same settings ends at {ends[1].mean():.0%} on the ten seeds above and "
-        f"at {ends[2].mean():.0%} on those ten: on all {len(finals)} seeds at {finals.mean():.0%} "
-        f"(95% CI {low:.0%} to {high:.0%}), {sum(finals >= 0.9)} of them at 90% or more."
-    )
-    assert text in " ".join(PAGE.split())
-
-
 def last(study: str, metric: str, stage: str, q: str) -> pd.Series:
     """The last value of each seed."""
     own = runs(study, stage).query("q == @q")
