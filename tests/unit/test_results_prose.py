@@ -240,8 +240,8 @@ def test_the_observations_in_the_joint_form_on_fetchpickandplace() -> None:
 
 
 def test_the_success_of_all_runs_of_music_on_fetchpickandplace() -> None:
-    studies = ("joint-pick-fresh", "joint-pick", "pick-and-place-in-80000-steps")
-    studies = (*studies, "intrinsic-rewards-pick")
+    others = "pick-and-place-in-80000-steps", "intrinsic-rewards-pick"
+    studies = ("joint-pick-fresh", "joint-pick", *others)
     finals = [last(study, MEAN, "music-r", "1") for study in studies]
     every = pd.concat(finals)
     low, high = stats.t.interval(0.95, len(every) - 1, every.mean(), stats.sem(every))
