@@ -34,7 +34,7 @@ class PointGoal(gym.Env):
 gym.register("PointGoal-v0", PointGoal, max_episode_steps=20)
 
 if __name__ == "__main__":
-    config = TACConfig().environment("PointGoal-v0").replay(hindsight_k=4)
+    config = TACConfig().environment("PointGoal-v0").replay(hindsight_k=4).debugging(seed=0)
     algo = config.training(gamma=0.9, hidden_sizes=[64, 64], replay_ratio=0.3).build_algo()
     for _ in range(10):
         print(f"success {algo.train()['env_runners']['success_last_step']:.0%}")

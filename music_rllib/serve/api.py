@@ -206,7 +206,7 @@ def make_api(facts: PolicyFacts, act: Act, token_sha256: str | None = None) -> F
     )
     most_bytes = 4096 + 64 * facts.max_rows * sum(facts.parts.values())
     # Without a token the service listens on loopback only.
-    api.add_middleware(_Lenient, most_bytes=most_bytes, token_sha256=token_sha256)
+    api.add_middleware(_Lenient, most_bytes=most_bytes, own_host=not token_sha256)
     api.add_exception_handler(RequestValidationError, _invalid)
     api.add_exception_handler(StarletteHTTPException, _refused)
     protected, unauthorized = [], Responses()
@@ -248,9 +248,6 @@ def make_api(facts: PolicyFacts, act: Act, token_sha256: str | None = None) -> F
     return api
 
 
-_PROTECTED = ("/act", "/policy")
-"""Paths that need the token, if there is one."""
-_NO_TOKEN, _ASK_FOR_TOKEN = "a valid bearer token is needed", {"WWW-Authenticate": "Bearer"}
 _SCHEME = HTTPBearer(auto_error=False)
 """The bearer token of a request. FastAPI looks annotations up in the module."""
 
@@ -259,14 +256,12 @@ def _bearer(expected: str) -> Callable[..., None]:
     """A check of the bearer token against the expected `token_hash`."""
 
     def check(given: Annotated[HTTPAuthorizationCredentials | None, Depends(_SCHEME)]) -> None:
-        if given is None or not _is_token(given.credentials, expected):
-            raise HTTPException(401, _NO_TOKEN, headers=_ASK_FOR_TOKEN)
+        if given is None or not hmac.compare_digest(token_hash(given.credentials), expected):
+            raise HTTPException(
+                401, "a valid bearer token is needed", headers={"WWW-Authenticate": "Bearer"}
+            )
 
     return check
-
-
-def _is_token(token: str, expected: str) -> bool:
-    return hmac.compare_digest(token_hash(token), expected)
 
 
 async def _refused(_: Request, error: Exception) -> JSONResponse:
@@ -306,15 +301,13 @@ def _is_loopback(host: str) -> bool:
 class _Lenient:
     """Middleware that treats HEAD as GET and any body as JSON, and rejects too long bodies.
 
-    It rejects requests without the token before their body is read, as FastAPI parses a body before
-    it checks a dependency. Without a token it rejects requests whose Host header names another
-    machine.
+    With `own_host` it also rejects requests whose Host header names another machine.
     """
 
-    def __init__(self, app: ASGIApp, most_bytes: int, token_sha256: str | None) -> None:
+    def __init__(self, app: ASGIApp, most_bytes: int, *, own_host: bool) -> None:
         self._app = app
         self._most_bytes = most_bytes
-        self._token_sha256 = token_sha256
+        self._own_host = own_host
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -330,15 +323,8 @@ class _Lenient:
                 raise HTTPException(413, f"the body must be <= {self._most_bytes} bytes")
             return message
 
-        given = {name: value.decode("latin-1") for name, value in scope["headers"]}
-        host, path = given.get(b"host", ""), scope["path"].removeprefix(scope.get("root_path", ""))
-        scheme, _, token = given.get(b"authorization", "").partition(" ")
-        is_known = scheme.lower() == "bearer" and _is_token(token.strip(), self._token_sha256 or "")
-        if self._token_sha256 and path in _PROTECTED and not is_known:
-            refusal = Failure(error=_NO_TOKEN).model_dump()
-            await JSONResponse(refusal, 401, _ASK_FOR_TOKEN)(scope, receive, send)
-            return
-        if not self._token_sha256 and not _is_loopback(host):
+        host = dict(scope["headers"]).get(b"host", b"").decode("latin-1")
+        if self._own_host and not _is_loopback(host):
             # Another host name that resolves to this machine is an attack (DNS rebinding).
             failure = Failure(error=f"the Host header must name this machine, got {host!r}")
             await JSONResponse(failure.model_dump(), 403)(scope, receive, send)

@@ -40,7 +40,7 @@ def printed(
 
 def test_an_own_environment_is_learned(printed: Callable[..., str]) -> None:
     rates = re.findall(r"success (\d+)%", printed("own_environment.py"))
-    assert int(rates[-1]) >= 80 > int(rates[0])
+    assert int(rates[-1]) >= 60 > int(rates[0])
 
 
 def test_own_networks_learn(printed: Callable[..., str]) -> None:
