@@ -254,9 +254,8 @@ def _changes(opened: OpenSweep) -> Changes | None:
 
 
 def _check(opened: OpenSweep) -> None:
-    """Run every check that can reject the sweep, before recording that it started."""
+    """Run the other checks that can reject the sweep, before recording that it started."""
     preflight.import_checkpoints(opened.plan, opened.store)
-    preflight.check_searches(opened)
     if (address := cluster_address()) is not None and not opened.scheduler.complete:
         check_reachable(address)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import shutil
 import signal
@@ -11,6 +12,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import psutil
@@ -191,21 +193,29 @@ def test_a_lease_dated_in_the_future_is_valid_while_renewed(
 def test_a_look_at_a_lease_from_a_fast_clock_takes_a_minute_at_most(
     place: LeaseFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lease_module, "EXPIRES_SECONDS", 0.6)
-    monkeypatch.setattr(lease_module, "LOOK_SECONDS", 0.1)
     theirs = elsewhere(seconds=3600.0)
+    later = theirs.model_copy(update={"expires": theirs.expires + 15})
+    start, renewed_after = time.time(), math.inf
+    passed = 0.0
+
+    def sleep(seconds: float) -> None:
+        nonlocal passed
+        passed += seconds
+        if passed >= renewed_after:
+            assert place.renew(later)
+
+    fake = SimpleNamespace(time=lambda: start + passed, monotonic=lambda: passed, sleep=sleep)
+    monkeypatch.setattr(lease_module, "time", fake)
     assert place.acquire(theirs) is None
     assert place.holder() == theirs
     assert place.holder(watch=True) is None, "it is not renewed"
+    assert passed == pytest.approx(60, abs=1)
     place.remove_invalid()
     assert place.read() is None, "others need not wait"
     assert place.acquire(theirs) is None
-    renewing = threading.Timer(
-        0.2, place.renew, [theirs.model_copy(update={"expires": theirs.expires + 1})]
-    )
-    renewing.start()
-    assert place.holder(watch=True) is not None, "it is renewed"
-    renewing.join()
+    renewed_after = passed + 15
+    assert place.holder(watch=True) == later, "it is renewed"
+    assert passed == pytest.approx(75, abs=1)
 
 
 def test_an_owner_that_lost_its_lease_leaves_no_folder(tmp_path: Path) -> None:
