@@ -82,15 +82,16 @@ def runs(study: str, stage: str) -> pd.DataFrame:
 
 
 @cache
-def metrics(study: str) -> pd.DataFrame:
+def curves(study: str) -> dict[tuple[int, str], tuple[Array, Array]]:
     path = DOCS / "results/data" / study / "metrics.parquet"
     table = pd.read_parquet(path, filters=[("metric", "in", [MEAN, SAMPLED, MOVED, *ENTROPIES])])
-    return table.dropna().set_index(["run", "metric"]).sort_index()
+    groups = table.dropna().sort_values("env_steps").groupby(["run", "metric"])
+    steps, values = groups.env_steps.agg(np.array), groups.value.agg(np.array)
+    return {key: (steps[key].astype(float), values[key]) for key in groups.groups}
 
 
 def curve(study: str, run: int, metric: str) -> tuple[Array, Array]:
-    points = metrics(study).loc[(run, metric)].sort_values("env_steps")
-    return points.env_steps.to_numpy(float), points.value.to_numpy()
+    return curves(study)[run, metric]
 
 
 def area(steps: Array, values: Array, budget: float) -> float:
@@ -115,7 +116,7 @@ def areas_of_all_steps(study: str, stage: str, metric: str, total: int, q: str =
     for run, source in zip(own.run, own.source, strict=True):
         steps, rates = curve(study, run, metric)
         if pd.notna(source):
-            (before,) = runs(study, "pretrain").query("key == @source").itertuples()
+            before = runs(study, "pretrain").set_index("key").loc[source]
             first, early = curve(study, before.run, metric)
             steps = np.concatenate([first, steps + before.budget])
             rates = np.concatenate([early, rates])

@@ -233,24 +233,24 @@ def test_a_healthy_server_passes() -> None:
 
 
 class SlowRun:
-    """A run whose records take at least three seconds altogether."""
+    """A run whose records take at least 0.6 s altogether."""
 
     node_key, source, refused, is_running = "a", None, None, False
     records = 30
 
     def send(self, *, policy: bool) -> None:
         while self.records:
-            time.sleep(0.1)
+            time.sleep(0.02)
             self.records -= 1
 
 
 def test_the_end_waits_for_mlflow_while_there_is_progress(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sender, "SAY_SECONDS", 0.2)
+    monkeypatch.setattr(sender, "SAY_SECONDS", 0.05)
     thread, run, said = sender.Sender("the store"), cast("Any", SlowRun()), list[int]()
     thread.add(run)
     thread.start()
-    assert not thread.flush(0.4), "without anybody to tell, this is the whole time"
-    assert thread.flush(2.0, said.append)
+    assert not thread.flush(0.1), "without anybody to tell, this is the whole time"
+    assert thread.flush(0.5, said.append)
     assert said == sorted(said, reverse=True)
     assert len(said) > 1
     thread.stop()
