@@ -199,7 +199,7 @@ def check_analysis(
     if analysis.margin is None and names.EVAL_RETURN in metrics:
         findings.add(("analysis", "margin"), "must be given for tasks without success, got null")
     if (analysis.margin or 0) >= 1 and metrics == {names.EVAL_SUCCESS}:
-        rule = f"must be < 1 for a success rate (5 % are 0.05), got {analysis.margin:g}"
+        rule = f"must be < 1 for a success rate (5% is 0.05), got {analysis.margin:g}"
         findings.add(("analysis", "margin"), rule)
 
 
@@ -287,7 +287,7 @@ def _broken_final(stage: Stage, condition: Mapping[str, str]) -> str | None:
     tuned = [name for name in condition if any(is_in(name, one) for one in search.space)]
     if search.final.trials == 1 and tuned:
         return (
-            "must not name what is tuned, as only the best trial has runs on fresh seeds: compare "
+            "must not name a tuned setting: only the best trial has runs on fresh seeds. Compare "
             f"its values by mode: compare in the search of {stage.name}, got {tuned[0]!r}"
         )
     given = bool(search.points_to_evaluate) and search.final.baselines

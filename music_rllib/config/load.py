@@ -114,7 +114,7 @@ def _list_seeds(document: Document, findings: Findings) -> None:
         return
     valid = 1 <= seeds <= MOST_SEEDS and seeds == int(seeds)
     if not valid:
-        rule = f"must be a list like [0, 1], or how many (1 to {MOST_SEEDS:,}), got {shown(seeds)}"
+        rule = f"must be a list like [0, 1], or a number (1 to {MOST_SEEDS:,}), got {shown(seeds)}"
         findings.add(("seeds",), rule)
     document.data["seeds"] = list(range(int(seeds))) if valid else [0]
 

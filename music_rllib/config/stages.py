@@ -229,7 +229,7 @@ def _source(header: StageHeader, find_tasks: FindTasks, findings: Findings) -> S
         findings.add(("checkpoint",), str(error))
         return None
     except RuntimeError:  # `~name/...`, and nobody has this name
-        rule = f"must be in a home that is known, got {shown(given.checkpoint)}"
+        rule = f"must be in an existing home folder, got {shown(given.checkpoint)}"
         findings.add(("checkpoint",), rule)
         return None
     return Source(checkpoint=ImportedHandoff(folder=folder, manifest=manifest), task=task)
@@ -263,7 +263,7 @@ def _check_checkpoint(
             findings.add(
                 (),
                 f"must be of task {wanted.name}, got one of {made_for.name}; "
-                f"if that is meant, say 'task: {made_for.name}' beside it",
+                f"to start from it, add 'task: {made_for.name}'",
             )
     problems_before = len(findings.problems)
     for _, point in stage.examples():

@@ -55,8 +55,8 @@ def report(
     sweeps: Annotated[
         list[str],
         typer.Argument(
-            help="A sweep's folder or URI, an exported folder, or a sweep's name; two for a "
-            "comparison of sweeps.",
+            help="A sweep's folder or URI, an exported folder, or a sweep's name or YAML file; two "
+            "for a comparison of sweeps.",
             metavar="SWEEP",
         ),
     ],
@@ -95,7 +95,7 @@ def report(
         ),
     ] = False,
     port: Annotated[
-        int | None, typer.Option(min=0, max=65535, help="With --serve. Default: a free port.")
+        int | None, typer.Option(min=0, max=65535, help="Port for --serve. Default: a free port.")
     ] = None,
     attach: Annotated[
         bool, typer.Option("--attach", help="Also store the report with the sweep's run in MLflow.")

@@ -44,6 +44,11 @@ _TEST = (
     "equivalence within the margin by two one-sided tests; Holm's correction over the planned "
     "comparisons, 5 %; finished runs only, none left out"
 )
+_NOTE = (
+    "A failed run counts with the worst value of the metric. The test is Welch's unless both "
+    "conditions have exactly the same seeds."
+)
+"""Completes `_TEST`, which can't change: it is a part of the hashes of published plans."""
 MOST_VERSIONS = 1000
 PLANS_TO_READ = "analysis_plan.md"
 
@@ -167,7 +172,7 @@ def with_plan(
 
 def as_markdown(name: str, versions: Sequence[PlanVersion]) -> str:
     """The versions as Markdown, the newest first."""
-    parts = [f"# Analysis plan of {name}\n"]
+    parts = [f"# Analysis plan of {name}\n\n{_NOTE}\n"]
     for one in reversed(versions):
         content = one.plan.model_dump(mode="json", exclude_none=True)
         text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=88)

@@ -213,7 +213,8 @@ def resolve_storage(storage: str) -> tuple[str, str | None]:
     try:
         path = Path(storage).expanduser()
     except RuntimeError as error:
-        raise StorageError(f"storage must be in a home that is known, got {storage!r}") from error
+        rule = f"storage must be in an existing home folder, got {storage!r}"
+        raise StorageError(rule) from error
     in_ray_job = "RAY_JOB_CONFIG_JSON_ENV_VAR" in os.environ
     if path.is_absolute() or not in_ray_job:
         return str(path.absolute()), None

@@ -6,6 +6,7 @@ import contextlib
 import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping
+from traceback import format_exc
 from typing import Any
 
 import numpy as np
@@ -228,21 +229,27 @@ class TAC(Algorithm):
         """Play one round on every remote runner, in their order; repeat it if a runner died.
 
         Raises:
-            RuntimeError: a runner could not be restarted.
+            RuntimeError: a runner could not be restarted, or failed again after its restart.
             BadNumberError: an environment returned an unusable number.
         """
+        restarted = False
 
         def play_with_state(runner: TrajectoryEnvRunner) -> tuple[Any, tuple[int, StateDict]]:
             try:
                 return play(runner), _random_state(runner)
             except BadNumberError as error:  # raised, it would count as the runner's death
                 return error, _random_state(runner)
+            except Exception:
+                if not restarted:
+                    raise  # the episode is repeated in a new process
+                text = f"an environment fails after a restart, too:\n{format_exc()}"
+                return RuntimeError(text), _random_state(runner)
 
         samples: dict[int, tuple[list[Episode], Any]] = {}
         give_up = time.monotonic() + REVIVE_SECONDS
         while missing := self._runner_states.keys() - samples.keys():
             for sample, (index, state) in self._call_runners(play_with_state, missing):
-                if isinstance(sample, BadNumberError):
+                if isinstance(sample, RuntimeError):
                     raise sample
                 samples[index], self._runner_states[index] = sample, state
             if self._runner_states.keys() - samples.keys():
@@ -255,6 +262,7 @@ class TAC(Algorithm):
                 if not restored:
                     time.sleep(0.5)
                     continue
+                restarted = True
                 self._make_on_env_runners_recreated_callbacks(
                     config=self.config,
                     env_runner_group=self.env_runner_group,

@@ -182,7 +182,7 @@ def presets(json: Json = False) -> int:
     width = max(map(len, shipped))
     for name, about in shipped.items():
         typer.echo(f"{name:{width}}  {about}")
-    typer.echo(f"\nEach file names the source of its numbers: {SHIPPED}")
+    typer.echo(f"\nThe files, with the sources of their numbers, are in {SHIPPED}")
     return 0
 
 

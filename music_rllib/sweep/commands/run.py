@@ -18,7 +18,7 @@ Examples:
       replace settings of the file in every stage; the sweep records them
   music-rllib run my.yaml --storage /data/results --name first-try
   music-rllib run my.yaml --seeds 10
-      seeds 0 to 9; only new seeds are trained
+      10 seeds, those of the file first; only new ones are trained
   music-rllib run my.yaml stages.train.env_steps=2e5
       train longer; finished runs of the stage continue from their end
 

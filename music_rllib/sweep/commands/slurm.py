@@ -23,7 +23,7 @@ Examples:
     --sbatch=--account=lab --storage /shared/results --submit
       write and submit it
   music-rllib status /shared/results/NAME
-      finished runs of all tasks, and what the task that wrote last computes
+      finished runs of all tasks, and the running runs of one task
 """
 FIXED = ("--signal=B:TERM@120", "--requeue", "--open-mode=append", "--output=%x-%j.log")
 """Options of every script; later ones replace them."""

@@ -128,7 +128,7 @@ TUNED_Q: Document = {
     "space": {"tac.entropic_index": {"choice": [1.0, 2.0]}},
 }
 UNTESTABLE: list[tuple[str, Document, str]] = [
-    ("q = 2 better than q = 1", search(BEST, TUNED_Q), "must not name what is tuned"),
+    ("q = 2 better than q = 1", search(BEST, TUNED_Q), "must not name a tuned setting"),
     ("q = 2, alpha = .1 better than q = 1", search(BEST), "got 'tac.alpha'"),
     (
         "q = 2 better than q = 1",  # the pair of equal settings is that of the baselines

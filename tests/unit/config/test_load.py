@@ -438,7 +438,7 @@ BAD: list[tuple[Document, str]] = [
     (with_stage(1, init_from={"task": "FetchPush"}), "must have exactly one of stage and check"),
     (with_stage(1, init_from={"stage": "pretrain", "task": "Fetch"}), "got 'Fetch'"),
     (with_stage(1, init_from={"checkpoint": "gone"}), "gone must hold a handoff (handoff.json"),
-    (with_stage(1, init_from={"checkpoint": "~nobody-at-all/x"}), "in a home that is known"),
+    (with_stage(1, init_from={"checkpoint": "~nobody-at-all/x"}), "in an existing home folder"),
     (with_stage(1, tasks=["FetchSlide"]), "needs a run of FetchSlide in stage pretrain"),
     (with_stage(1, music={"lr": 0.1}), "music.lr has no effect with variant music-r"),
     (
@@ -517,7 +517,7 @@ BAD: list[tuple[Document, str]] = [
     (asking("stage = a against q = 1"), "must name one of the stages pretrain, finetune, got 'a'"),
     (asking("q = 1.5 against q = 1", stage="x"), "analysis.stage must be one of pretrain, finet"),
     (asking("q = 1.5 against q = 1", margin=0), "analysis.margin must be > 0, got 0"),
-    (asking("q = 1.5 against q = 1", margin=5), "margin must be < 1 for a success rate (5 % are"),
+    (asking("q = 1.5 against q = 1", margin=5), "margin must be < 1 for a success rate (5% is"),
     (
         asking("q = 1.5 against q = 1") | {"defaults": {"tac": {"gamma": 3.0}}},
         "defaults.tac.gamma must be < 1, got 3.0",

@@ -228,7 +228,7 @@ REFUSED: list[tuple[str, str]] = [
     ("tac.alpha=[.1, .2]", "belong in a stage's grid: {tac.alpha: [0.1, 0.2]}"),
     ("stages.third.env_steps=1", "must be stages.NAME.KEY, with NAME one of first, second"),
     ("stages.first.q=1", "stages.first.q is not a known setting (did you mean 'tac.entropic"),
-    ("seeds=0", "command line: seeds must be a list like [0, 1], or how many (1 to "),
+    ("seeds=0", "command line: seeds must be a list like [0, 1], or a number (1 to "),
     ("env_steps=1.5", "command line: env_steps must be a whole number, got 1.5"),
     ("tac.lr", "command line: must be KEY=VALUE like tac.alpha=0.1"),
     ("tac.lr=[", "command line: tac.lr must be valid YAML"),

@@ -345,7 +345,7 @@ LONG = "x" * 300
         (("compare", "s3:/b/c"), "storage must name a bucket as in s3://BUCKET, got 's3:/b'"),
         (("serve", ""), "the run must not be empty, got ''"),
         (("evaluate", "x", "--storage", "s3://?region=x"), "storage must name a bucket as "),
-        (("evaluate", "x", "--storage", "~nobody-at-all/x"), "storage must be in a home that is"),
+        (("evaluate", "x", "--storage", "~nobody-at-all/x"), "storage must be in an existing home"),
         (
             ("evaluate", "x", "--storage", "sweep.yaml"),
             "--storage must be a place that can be read",
@@ -358,7 +358,7 @@ LONG = "x" * 300
             ("plan", "sweep.yaml", "--storage", "file:///x?y=1"),
             "storage must be a folder, or file:///FOLDER, got 'file:///x?y",
         ),
-        (("status", "~nobody-at-all/x"), "storage must be in a home that is known"),
+        (("status", "~nobody-at-all/x"), "storage must be in an existing home folder"),
         (("evaluate", f"{LONG}/seed0"), f"'{LONG}/seed0' must be a folder, or the key or label"),
         (("status", LONG), f"SWEEP must be a sweep that was started, got {LONG}"),
         (("status", f"{LONG}/s"), "/"),  # the path, and that its name is too long

@@ -872,6 +872,7 @@ def test_an_analysis_plan_is_recorded_and_changes_no_run(
     versions = recorded(margin=0.1)
     assert [(one["version"], one["plan"]["margin"]) for one in versions] == [(1, 0.05), (2, 0.1)]
     text = (folder / "analysis_plan.md").read_text()
+    assert "failed run counts with the worst value" in text
     assert versions[1]["hash"] in text
     assert "- q = 1.5 better than q = 1" in text
     (folder / "analysis_plan.json").write_text(json.dumps(versions).replace("0.05", "0.4"))
