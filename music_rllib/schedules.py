@@ -19,6 +19,7 @@ from pydantic import (
     ConfigDict,
     Discriminator,
     Field,
+    JsonValue,
     Tag,
     model_validator,
 )
@@ -33,6 +34,19 @@ class StrictModel(BaseModel):
     """Immutable settings without unknown keys, infinities and NaN."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+def _finite(value: JsonValue) -> JsonValue:
+    if isinstance(value, dict | list):
+        for inner in value.values() if isinstance(value, dict) else value:
+            _finite(inner)
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError(f"must be a finite number, got {value}")
+    return value
+
+
+Plain = Annotated[JsonValue, AfterValidator(_finite)]
+"""A value of the user's own code; the key of a run, which is a hash of JSON, can hold it."""
 
 
 class Linear(StrictModel):

@@ -66,15 +66,19 @@ def check_search(
 
 def _broken_metric(metric: str, stage: Stage) -> str | None:
     """The rule that an objective's metric breaks; None if each run reports it."""
-    known = {
+    prefixes = (names.SHANNON_OF_DIMENSION, names.ENTROPY_OF_DIMENSION)
+    known = {names.ENV_STEPS, names.GRAD_UPDATES} | {
         value
         for key, value in vars(names).items()
-        if key.isupper()
-        and isinstance(value, str)
-        and not value.isupper()  # an environment variable
-        and not key.startswith(("TAG_", "KIND_", "ARTIFACT_", "SETTING_"))
+        if isinstance(value, str)
+        and value.partition("/")[0] in names.GROUPS
+        and value not in prefixes
+        and not key.startswith(("ARTIFACT_", "SETTING_"))
     }
-    if metric not in known:
+    of_dimension = any(
+        metric.startswith(one) and metric.removeprefix(one).isdecimal() for one in prefixes
+    )
+    if metric not in known and not of_dimension:
         hint = closest(metric, known)
         return f"must be a metric that runs report, got {shown(metric)}{hint}"
     without = [task.name for task in stage.tasks if task.success_key is None]
@@ -141,7 +145,7 @@ def _runs_above(above: Stage, point: PlacedPoint, findings: Findings) -> Mapping
     if not theirs:
         return None
     try:
-        return above.resolve(theirs).runs
+        return above.resolve({**above.points[0].values, **theirs}).runs
     except ConfigError as error:
         name = next(name for name in point if name.startswith(f"{above.name}:"))
         for line in error.lines:

@@ -121,7 +121,7 @@ def _list_seeds(document: Document, findings: Findings) -> None:
 
 def _parsed_seeds(text: str, given: Any) -> list[float]:
     """The seeds of `10` or `0,1,7`; a number keeps the seeds `given` in the file."""
-    digits = re.fullmatch(r"\d{1,9}(,\d{1,9})*,?", text)
+    digits = re.fullmatch(r"\d{1,10}(,\d{1,10})*,?", text)
     if digits and "," not in text and int(text) > MOST_SEEDS:
         raise ConfigError([f"--seeds must be at most {MOST_SEEDS:,} seeds, got {text}"])
     if not digits or text == "0":
@@ -152,7 +152,7 @@ def _check_recorded(value: Any, findings: Findings) -> None:
             continue
         kept = without_secrets(inner)
         for name in inner:
-            if str(name) not in kept or kept[str(name)] != inner[name]:
+            if str(name) not in kept or repr(kept[str(name)]) != repr(inner[name]):
                 rule = "must have another name or value: this one looks like a secret, which is"
                 findings.add((key, name), f"{rule} not recorded for `resume`")
 

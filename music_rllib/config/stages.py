@@ -303,7 +303,9 @@ def _check_stage(stage: Stage, task: Task | None, above: Stage, findings: Findin
     for values, point in stage.examples():
         searched = of_stage(values, above.name)
         with contextlib.suppress(ConfigError):  # invalid values are a problem of their own
-            for source in [above.resolve(searched)] if searched else above.points:
+            # A source whose settings are searched has one point.
+            whole = {**above.points[0].values, **searched}
+            for source in [above.resolve(whole)] if searched else above.points:
                 for name, run in point.runs.items():
                     theirs = source.runs.get(task.name if task else name)
                     if theirs is not None:  # a problem of its own, above

@@ -38,7 +38,7 @@ from pydantic import (
 
 from music_rllib import names
 from music_rllib.envs.features import Indices, Mirror, Symmetries, Translation, check_split
-from music_rllib.schedules import StrictModel
+from music_rllib.schedules import Plain, StrictModel
 
 LAST_SEED = 2**31 - 1
 """Largest seed of a reset: environments often keep it in a signed 32-bit integer."""
@@ -63,7 +63,7 @@ class Task(StrictModel):
     success_key: str | None = "is_success"
     """Key of `info` that reports success; a step without the key is not a success. null: the
     environment does not define success."""
-    env_kwargs: dict[str, JsonValue] = Field(default_factory=dict)
+    env_kwargs: dict[str, Plain] = Field(default_factory=dict)
     """Arguments of `gymnasium.make`, as YAML reads them: `1e2` is the float 100.0. Only
     `max_episode_steps: 1e2` becomes an integer."""
     reward_range: tuple[float, float] | None = None

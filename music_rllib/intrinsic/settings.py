@@ -8,9 +8,9 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, Field, JsonValue, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
-from music_rllib.schedules import AdaptiveSchedule, StrictModel, bounded
+from music_rllib.schedules import AdaptiveSchedule, Plain, StrictModel, bounded
 
 BUILT_IN: Mapping[str, str] = MappingProxyType(
     {
@@ -62,7 +62,7 @@ class IntrinsicSettings(StrictModel):
     the task unchanged at the end. 1 for intrinsic-u."""
     lr: float = Field(1e-3, gt=0)
     """Adam's step size for its networks, which take a step at every fourth update."""
-    settings: dict[str, JsonValue] = Field(default_factory=dict)
+    settings: dict[str, Plain] = Field(default_factory=dict)
     """Keyword arguments of its class, such as `{hidden: 128}`."""
     frozen: bool = False
     """Whether its networks are of another run and not trained; fixed by the variant."""

@@ -18,6 +18,7 @@ from pydantic_core import from_json
 
 from music_rllib import names
 from music_rllib.config.schema import SweepConfig
+from music_rllib.config.yaml_file import Dumper
 from music_rllib.envs.fingerprint import digest_of
 from music_rllib.errors import reason_of
 from music_rllib.experiment import sweep_files
@@ -101,7 +102,9 @@ def read_stored(
         started=min((run.started for run in runs if run.started is not None), default=None),
         source=redact(opened.storage),
         tags=next((one.provenance for one in reversed(found) if one.provenance), {}),
-        config=yaml.safe_dump(configuration, sort_keys=False, allow_unicode=True, width=math.inf),
+        config=yaml.dump(
+            configuration, Dumper=Dumper, sort_keys=False, allow_unicode=True, width=math.inf
+        ),
         runs=runs,
         history=columns(one.points for one in found),
         searches=searches_of(location, opened.config),

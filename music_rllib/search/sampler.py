@@ -64,9 +64,12 @@ class Proposer:
             running: The trials between those and `number`, which have points.
         """
         space = self._settings.space
-        if self._settings.sampler == "grid":
-            return trial_at(space, (self._settings.points or [])[number])
         tried = {_key(space, trial.user_attrs[VALUES]) for trial in (*ended, *running)}
+        if self._settings.sampler == "grid":
+            points = self._settings.points or []
+            # Another, if earlier trials had the keys of the space in another order.
+            left = (p for p in (points[number], *points) if _key(space, p) not in tried)
+            return trial_at(space, next(left))
         given = self._points[number] if number < len(self._points) else {}
         if given and _key(space, given) in tried:
             given = {}

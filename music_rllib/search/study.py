@@ -340,6 +340,10 @@ def _first_points(
     if settings.sampler == "grid" or not older:
         return given
     trials = storage.get_all_trials(max(older), deepcopy=False)
-    earlier = [trial.user_attrs.get(VALUES) for trial in trials if trial.state.is_finished()]
-    fitting = [point for point in earlier if point and fits(point, settings)]
-    return given + [point for point in fitting if not any(same(point, one) for one in given)]
+    # It may have been stopped before it evaluated the points that it took over itself.
+    earlier = list(storage.get_study_user_attrs(max(older))[POINTS])
+    earlier += [trial.user_attrs.get(VALUES) for trial in trials if trial.state.is_finished()]
+    for point in earlier:
+        if point and fits(point, settings) and not any(same(point, one) for one in given):
+            given.append(point)
+    return given

@@ -14,14 +14,14 @@ import yaml
 from music_rllib import names
 from music_rllib.config.run_settings import VARIANTS
 from music_rllib.config.schema import Stage
+from music_rllib.config.yaml_file import Dumper
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.errors import BadInputError
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.open_sweep import OpenSweep, open_started
-from music_rllib.experiment.plan import Node
+from music_rllib.experiment.plan import Node, Plan
 from music_rllib.experiment.sweep_files import SweepLocation
 from music_rllib.redaction import redact
-from music_rllib.results.conditions import Condition
 from music_rllib.results.data import LastValues, RunRecord, Sweep
 from music_rllib.results.read import searches_of
 from music_rllib.search.best import best_so_far, best_text, condition_of, ranking_metric
@@ -94,8 +94,8 @@ def _export_condition(
     output: Path,
 ) -> dict[str, Any]:
     """Export the policies of one condition, on all its tasks or on the task of `best`."""
-    scored = condition_of(best, stage, opened.plan, sweep, metric)
-    if scored is None:
+    runs = _runs_of(best, stage, opened.plan, sweep, metric)
+    if not any(sweep.final(run, metric) is not None for run in runs):
         raise BadInputError(
             f"SWEEP must have the runs of its best trial, {best['trial']} of stage {stage.name}: "
             f"{redact(opened.storage)} has none of them"
@@ -116,10 +116,10 @@ def _export_condition(
         "why": best_text(best),
     }
     policies = []
-    tasks = list(dict.fromkeys(sweep.runs[run].task for run in scored.condition.runs))
+    tasks = list(dict.fromkeys(sweep.runs[run].task for run in runs))
     tasks = [best["task"]] if "task" in best else tasks
     for task in tasks:
-        run = _median_run(sweep, scored.condition, task, metric)
+        run = _median_run(sweep, runs, task, metric)
         if run is None:
             continue
         folder = output if len(tasks) == 1 else output / task
@@ -135,11 +135,24 @@ def _export_condition(
     return chosen | {"policies": policies}
 
 
-def _median_run(sweep: Sweep, condition: Condition, task: str, metric: str) -> RunRecord | None:
+def _runs_of(
+    best: Mapping[str, Any], stage: Stage, plan: Plan, sweep: Sweep, metric: str
+) -> Sequence[int]:
+    """The runs of the best condition; those of a trial may be runs of an earlier stage, too."""
+    if stage.search is None:
+        scored = condition_of(best, stage, plan, sweep, metric)
+        return () if scored is None else scored.condition.runs
+    part = f"{'final' if best['on_fresh_seeds'] else 'trial'}{best['trial']}"
+    own = (run for run in plan.runs if (run.stage, run.part) == (stage.name, part))
+    keys = {run.key for run in own if dict(run.values) == best["values"]}
+    return [position for position, run in enumerate(sweep.runs) if run.node_key in keys]
+
+
+def _median_run(sweep: Sweep, runs: Sequence[int], task: str, metric: str) -> RunRecord | None:
     """The run with the median score on a task; None if none is finished."""
     scores = [
         (score, int(sweep.runs[run].seed), run)
-        for run in condition.runs
+        for run in runs
         if sweep.runs[run].task == task and (score := sweep.final(run, metric)) is not None
     ]
     return sweep.runs[sorted(scores)[len(scores) // 2][2]] if scores else None
@@ -160,7 +173,7 @@ def _export(opened: OpenSweep, key: str, folder: Path, chosen: Mapping[str, Any]
                         )
                     shutil.rmtree(target)
                 part.replace(target)
-        document = yaml.safe_dump(sweep_of_run(opened, key, folder), sort_keys=False)
+        document = yaml.dump(sweep_of_run(opened, key, folder), Dumper=Dumper, sort_keys=False)
         write_atomically(folder / CHOSEN, sweep_files.as_json(chosen).encode())
         write_atomically(folder / "run.yaml", document.encode())
     except OSError as error:

@@ -26,6 +26,7 @@ import yaml
 
 from music_rllib import names
 from music_rllib.command_line import PROGRAM
+from music_rllib.config.yaml_file import Dumper
 from music_rllib.errors import TrackingError, is_stop
 from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.run_info import RunInfo
@@ -320,4 +321,4 @@ def _plan_key(config: Mapping[str, object]) -> str:
 def _as_yaml(settings: Mapping[str, object]) -> str:
     """Settings as a YAML file, without secrets."""
     plain = json.loads(json.dumps(without_secrets(settings), default=str))
-    return str(yaml.safe_dump(plain, sort_keys=False, allow_unicode=True))
+    return str(yaml.dump(plain, Dumper=Dumper, sort_keys=False, allow_unicode=True))

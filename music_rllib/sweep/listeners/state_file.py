@@ -229,8 +229,10 @@ class StateFile(Listener):
             if stage.search is None or begun or stage.name in complete:
                 continue  # the runs on fresh seeds come last and all at once
             at_most = sum(one.all_env_steps for one in searched_runs(config, stage))
-            known = sum(node.run.env_steps for node in plan.nodes if node.stage == stage.name)
-            steps += max(0, at_most - known)
+            # Also the runs that they start from, unless the plan had them before the search.
+            keys = {node.key for run in asked for node in plan.chain(run.key)}
+            keys = {key for key in keys if not self._sweep.scheduler.is_planned(key)}
+            steps += max(0, at_most - sum(plan.node(key).run.env_steps for key in keys))
         return steps
 
     # -- the thread --------------------------------------------------------------------------

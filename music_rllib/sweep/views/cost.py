@@ -95,14 +95,15 @@ def searched_runs(config: SweepConfig, stage: Stage) -> list[RunGroup]:
         finalists = min(final.most(len(search.points_to_evaluate)), search.count)
         phases.append((finalists, final.seeds, final.env_steps or stage.most_env_steps))
     runs: Counter[tuple[str, str, int]] = Counter()
-    source = config.source_of(stage)
     for fresh, (trials, seeds, env_steps) in enumerate(phases):
-        if source is not None:
+        source = config.source_of(stage)
+        while source is not None:
             points = _points_of(search, source.name)
             # A source whose settings are not searched has its other runs in the plan.
             count = min(trials * studies, points) if fresh or points > 1 else 0
             for task, run in source.points[0].runs.items():
                 runs[source.name, task, run.env_steps] += count * seeds
+            source = config.source_of(source)
         for task in stage.points[0].runs:
             runs[stage.name, task, env_steps] += trials * studies * seeds
     return [

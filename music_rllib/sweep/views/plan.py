@@ -40,14 +40,15 @@ def plan_view(config: SweepConfig, plan: Plan, finished: Collection[str]) -> Ren
     seeds = len(config.seeds)
     searched = _searched_runs(config)
     for stage in config.stages:
-        cells = _stage_cells(stage, plan, finished, searched.get(stage.name, ()))
+        own = [one for one in searched.get(stage.name, ()) if one.stage == stage.name]
+        cells = _stage_cells(stage, plan, finished, own)
         table.add_row(stage.name, *cells)
     lines = [*(_stage_text(stage, seeds) for stage in config.stages), _summary(plan, finished)]
     if groups := [group for of_stage in searched.values() for group in of_stage]:
         runs, steps = sum(one.runs for one in groups), sum(one.all_env_steps for one in groups)
+        sources = any(group.stage not in searched for group in groups)
         lines[-1] += f" Searches: up to {runs} more runs and {steps:,} more env steps"
-        fresh = any(one.search and one.search.final and one.source for one in config.stages)
-        lines[-1] += ", without the source runs of fresh seeds." if fresh else "."
+        lines[-1] += ", with the runs that they start from." if sources else "."
     parts: list[RenderableType] = [table, *map(Text, lines)]
     if rows := alpha_rows(plan):
         parts.append(_alpha_table(rows))
@@ -55,16 +56,13 @@ def plan_view(config: SweepConfig, plan: Plan, finished: Collection[str]) -> Ren
 
 
 def _searched_runs(config: SweepConfig) -> dict[str, list[RunGroup]]:
-    """Name of each searched stage to the runs of its search, without those they start from."""
+    """Name of each searched stage to the runs of its search, with those that they start from."""
     searched = [stage for stage in config.stages if stage.search is not None]
     if not searched:
         return {}
     from music_rllib.sweep.views.cost import searched_runs
 
-    return {
-        stage.name: [one for one in searched_runs(config, stage) if one.stage == stage.name]
-        for stage in searched
-    }
+    return {stage.name: searched_runs(config, stage) for stage in searched}
 
 
 def _stage_cells(
@@ -164,7 +162,9 @@ def plan_answer(opened: OpenSweep, changes: str) -> dict[str, Any]:
             "sampler": stage.search.sampler,
             "studies": len(stage.search.compared()),
             "trials": stage.search.count,
-            "runs_at_most": sum(group.runs for group in searched[stage.name]),
+            "runs_at_most": sum(
+                group.runs for group in searched[stage.name] if group.stage == stage.name
+            ),
             "space": stage.search.model_dump(mode="json", by_alias=True)["space"],
         }
         for stage in config.stages

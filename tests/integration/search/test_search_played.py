@@ -914,3 +914,55 @@ def test_an_extended_search_that_was_killed_before_its_record_shows_its_new_tria
         driver.controller.stop()
     (shown,) = searches_of(driver.sweep.location, driver.sweep.config)
     assert len(shown["arms"][0]["trials"]) == 3
+
+
+def test_a_grid_whose_keys_change_places_tries_every_point(tmp_path: Path) -> None:
+    space = {"tac.alpha": {"choice": [0.1, 0.2]}, "tac.entropic_index": {"choice": [1.0, 2.0]}}
+    grid = {"sampler": "grid", "space": space}
+    searched(tmp_path, {**grid, "trials": 2}, seeds=[0])
+    grid["space"] = dict(reversed(space.items()))
+    after = searched(tmp_path, {**grid, "trials": 4}, seeds=[0])
+    assert len({json.dumps(point, sort_keys=True) for point in points(after.trials())}) == 4
+
+
+def test_points_of_a_study_outlive_one_that_was_stopped_at_once(tmp_path: Path) -> None:
+    before = searched(tmp_path, {"trials": 4}, seeds=[0])
+    for lowest in (0.001, 0.002):
+        space = SPACE | {"tac.alpha": {"float": [lowest, 0.9], "log": True}}
+        driver = Driver(tmp_path, document({"trials": 6, "space": space}, seeds=[0]))
+    driver.play()
+    assert points(driver.trials())[:4] == points(before.trials())
+    assert len(driver.computed) == 2
+
+
+def test_best_exports_a_trial_that_equals_a_run_of_an_earlier_stage(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    search = {
+        "space": {"tac.entropic_index": {"choice": [1.0, 1.5]}},
+        "sampler": "grid",
+        "final": None,
+    }
+    stages = [
+        {"name": "coarse", "variant": "tac", "grid": {"tac.entropic_index": [1.5]}},
+        {"name": "tuned", "variant": "tac", "search": search},
+    ]
+    content = document({}, seeds=[0, 1], stages=stages)
+    Driver(tmp_path, content).play()
+    recorded(tmp_path, content)
+    place, out = str(tmp_path / "results/s"), str(tmp_path / "out")
+    chosen = answered(capsys, "best", place, "--stage", "tuned", "--output", out)
+    assert chosen["values"] == {"tac.entropic_index": 1.5}
+    assert [policy["task"] for policy in chosen["policies"]] == ["FetchPush"]
+
+
+def test_steps_to_come_are_without_sources_that_the_search_has_asked_for(tmp_path: Path) -> None:
+    space = {"tac.alpha": {"choice": [0.05, 0.1]}, "pretrain:music.lr": {"choice": [0.001, 0.01]}}
+    content = document(
+        {"space": space, "sampler": "grid", "trials": None, "concurrent": 4}, seeds=[0]
+    )
+    content["stages"][0]["env_steps"] = 50_000
+    Driver(tmp_path, content).play(stop_after=5, slots=1)
+    recorded(tmp_path, content)
+    state = json.loads((tmp_path / "results/s/state.json").read_text())
+    assert state["env_steps"] == {"done": 112_000, "left": 4_000, "to_come": 0}

@@ -15,6 +15,7 @@ from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.results.analysis_plan import analysis_plan
 from music_rllib.schedules import Linear
 from tests.handoffs import music_u, write_estimator
+from tests.played_search import document
 from tests.sweep_files import loaded
 
 Document = dict[str, Any]
@@ -467,7 +468,7 @@ BAD: list[tuple[Document, str]] = [
     ),
     (
         with_stage(0, intrinsic={"reward": "rnd", "settings": {"hidden": float("inf")}}),
-        "settings.hidden must be a number > 0, got inf",
+        "settings.hidden must be a finite number, got inf",
     ),
     (
         with_stage(0, intrinsic={"reward": "rnd", "settings": {"hidden": 2.5}}),
@@ -745,3 +746,22 @@ def test_each_task_is_compared_with_its_own_source(
     other = stages[1] | {"init_from": {"stage": "pretrain", "task": "FetchPush"}}
     lines = problems(changed(tasks=tasks, stages=[stages[0], other]))
     assert ["surrounding indices in PointCarry as in FetchPush" in one for one in lines] == [True]
+
+
+@pytest.mark.parametrize("value", [float("inf"), float("nan"), [1, {"x": float("-inf")}]])
+def test_arguments_of_an_environment_are_finite(value: Any, tmp_path: Path) -> None:
+    task = {"env_id": "m:M-v0", "horizon": 9, "env_kwargs": {"limit": value}}
+    content = document(
+        {}, tasks=["M"], environments={"M": task}, stages=[{"name": "t", "variant": "tac"}]
+    )
+    with pytest.raises(ConfigError) as error:
+        loaded(tmp_path, content)
+    assert "limit must be a finite number, got" in str(error.value)
+    assert "secret" not in str(error.value)
+
+
+def test_large_seeds_of_the_file_can_be_given_as_an_argument(tmp_path: Path) -> None:
+    content = document({}, stages=[{"name": "t", "variant": "tac"}])
+    assert loaded(tmp_path, content, seeds="2147483647,1").seeds == (2147483647, 1)
+    with pytest.raises(ConfigError, match="must be < 2"):
+        loaded(tmp_path, content, seeds="2147483648,1")

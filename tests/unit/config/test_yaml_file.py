@@ -5,12 +5,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
 from music_rllib.config.document import Document
 from music_rllib.config.problems import ConfigError
-from music_rllib.config.yaml_file import YamlFile, read_yaml
+from music_rllib.config.yaml_file import Dumper, YamlFile, read_value, read_yaml
 
 
 def read(tmp_path: Path, text: str) -> YamlFile:
@@ -148,3 +149,8 @@ def test_merge_keys_may_form_a_chain_that_is_used_above_it(tmp_path: Path) -> No
     chain = "a:\n  in:\n    deep: &slow\n      <<: &base {x: 1, y: 2}\n      x: 3\n"
     file = read(tmp_path, f"{chain}b:\n  <<: *slow\n  z: 4\n")
     assert file.data == {"a": {"in": {"deep": {"x": 3, "y": 2}}}, "b": {"x": 3, "y": 2, "z": 4}}
+
+
+def test_text_that_looks_like_a_number_stays_text() -> None:
+    values = ["12e4", "1e3", "no", "010", 1e16, 1e-5, None, "", "3", True]
+    assert read_value(yaml.dump(values, Dumper=Dumper)) == values

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from pydantic import ValidationError
+from rich.console import Console
 from scipy import stats
 
 from music_rllib import names
@@ -26,7 +27,8 @@ from music_rllib.search.objective import aggregate, interval, reason_to_prune, s
 from music_rllib.search.sampler import VALUES, Proposer, trial_at
 from music_rllib.search.study import fits
 from music_rllib.store.history import Report, RunResult
-from tests.played_search import Document, document
+from music_rllib.sweep.views.plan import plan_view
+from tests.played_search import SPACE, Document, document
 from tests.sweep_files import loaded
 
 
@@ -567,3 +569,34 @@ def test_the_best_condition_of_a_task_is_that_of_its_own_metric(tmp_path: Path) 
     assert (best["task"], best["metric"]) == ("FetchReach", names.EVAL_SUCCESS)
     assert best["values"] == {"tac.entropic_index": 1.5}
     assert best["other_tasks"][0]["metric"] == names.EVAL_RETURN
+
+
+def test_a_searched_source_keeps_its_one_grid_point(tmp_path: Path) -> None:
+    space = {"tac.alpha": {"choice": [0.1, 0.2]}, "pretrain:music.lr": {"choice": [0.001, 0.01]}}
+    content = document({"space": space})
+    content["stages"][0]["grid"] = {"music.hidden_size": [64]}
+    content["stages"][1]["music"] = {"hidden_size": 64}
+    loaded(tmp_path, content)
+
+
+def test_the_plan_counts_pretraining_that_a_search_varies(tmp_path: Path) -> None:
+    space = SPACE | {"pretrain:music.lr": {"float": [0.0001, 0.01], "log": True}}
+    content = document({"space": space, "trials": 10, "final": {"seeds": 5, "trials": 3}})
+    content["stages"][0]["env_steps"] = 50_000
+    config = loaded(tmp_path, content)
+    console = Console(width=200)
+    with console.capture() as capture:
+        console.print(plan_view(config, make_plan(config), ()))
+    runs = 10 * 3 + 3 * 5
+    assert f"up to {2 * runs} more runs and {runs * (50_000 + 4_000):,} more" in capture.get()
+
+
+@pytest.mark.parametrize("metric", ["entropy/shannon_dimension_0", "entropy/tsallis_dimension_12"])
+def test_the_entropy_of_a_dimension_can_be_an_objective(metric: str, tmp_path: Path) -> None:
+    loaded(tmp_path, document({"objective": {"metric": metric}}))
+
+
+@pytest.mark.parametrize("metric", ["entropy/shannon_dimension_", "yes", "0"])
+def test_names_that_no_run_reports_are_refused(metric: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="must be a metric that runs report"):
+        loaded(tmp_path, document({"objective": {"metric": metric}}))
