@@ -120,6 +120,7 @@ class IntrinsicReward(nn.Module, ABC):
         """
         bonus = self.bonus(batch)
         check_result(self, "bonus", bonus, (len(batch.states),))
+        bonus = bonus.to(batch.states.dtype)  # compiled updates take one type of numbers
         wrong = bonus[~((bonus >= 0.0) & (bonus < torch.inf))]
         if len(wrong):
             rule = f"{type(self).__name__}.bonus must return finite numbers >= 0"

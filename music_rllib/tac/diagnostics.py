@@ -151,6 +151,7 @@ def critic_bias(
     module: TACModule,
     objective: TACLoss,
     noise: Mapping[str, Tensor],
+    n_steps: int = 1,
 ) -> float:
     """Mean over episodes of the critics' value of the first step minus the realized return.
 
@@ -158,6 +159,7 @@ def critic_bias(
         rewards: [S] with the intrinsic reward.
         objective: gives the entropy's part of the return, and the value after a truncation.
         noise: standard normal noise [S, A] for the policy's actions, by name.
+        n_steps: of the critics' targets, which leave out the entropies of the steps in between.
     """
     first = np.cumsum([0, *fresh.lengths[:-1]])
     last = np.cumsum(fresh.lengths) - 1
@@ -166,7 +168,9 @@ def critic_bias(
     entropy = -objective.ln_q(log_density).expand(len(rewards))
     earned = (rewards + float(objective.alpha) * entropy).cpu().numpy().astype(float)
     # A critic's value does not include the entropy of the action that it is given.
-    earned[first] = rewards.cpu().numpy()[first]
+    steps = np.concatenate([np.arange(length) for length in fresh.lengths])
+    without = (steps == 0) | (steps % n_steps > 0)
+    earned[without] = rewards.cpu().numpy()[without]
     ends = {Columns.NEXT_OBS: fresh.followers[last]}
     ends |= {name: values[last] for name, values in noise.items()}
     tails = objective.soft_value(module.forward_target(ends))

@@ -314,10 +314,9 @@ class TACLearner(TorchLearner):
         """[K, B] intrinsic rewards, each minibatch's before the update of its networks."""
         if "estimator" not in self._adam:
             return minibatches.music_rewards(self._music)
-        states, followers = minibatches.transitions
         trajectories = minibatches.columns[ESTIMATOR_MODULE]
         rewards, metrics = self._music.learn(
-            states, followers, minibatches.drawn, trajectories, self._adam["estimator"]
+            *minibatches.transitions, minibatches.drawn, trajectories, self._adam["estimator"]
         )
         self._losses |= metrics
         return rewards
@@ -360,13 +359,15 @@ class TACLearner(TorchLearner):
         if self._music.is_on:
             intrinsic = self._music.observe(episodes, states, followers, self._generator)
             rewards = self._music.total(rewards, intrinsic, self._now.mi_reward_weight)
-        if self.bonus is not None:
+        by_minibatch = self.bonus is not None and self.bonus.reward.by_minibatch
+        if self.bonus is not None and not by_minibatch:
             batch = self.bonus.batch(states, fresh.actions, followers, self._generator)
             rewards = self._with_bonus(rewards, self.bonus.observe(batch, values))
-        noise = self._policy_noise(fresh.actions)
-        bias = critic_bias(fresh, rewards, self._policy_module, self._objective, noise)
-        if self.bonus is None or not self.bonus.reward.by_minibatch:
-            self.metrics.log_value((DEFAULT_MODULE_ID, names.Q_BIAS), bias, window=1)
+        noise, n_steps = self._policy_noise(fresh.actions), self.config.settings.replay.n_steps
+        if by_minibatch:
+            return  # one batch of all steps would have other rewards, and takes much memory
+        bias = critic_bias(fresh, rewards, self._policy_module, self._objective, noise, n_steps)
+        self.metrics.log_value((DEFAULT_MODULE_ID, names.Q_BIAS), bias, window=1)
 
     @torch.no_grad()
     def trajectory_priorities(self, episodes: Sequence[Trajectory]) -> NDArray[np.float64]:
@@ -376,10 +377,9 @@ class TACLearner(TorchLearner):
 
     def take_td_errors(self) -> NDArray[np.float32]:
         """[K*B] absolute TD errors of the last call's transitions, for prioritized replay."""
-        assert self._td_errors is not None
-        errors: NDArray[np.float32] = self._td_errors.cpu().numpy()
-        self._td_errors = None
-        return errors
+        errors, self._td_errors = self._td_errors, None
+        assert errors is not None
+        return np.asarray(errors.cpu(), np.float32)
 
     # -- normalizer, state ----------------------------------------------------------------
 

@@ -12,6 +12,8 @@ from ray.rllib.core import DEFAULT_MODULE_ID
 from torch import Tensor
 
 from music_rllib import names
+from music_rllib.functional.distribution import sample_squashed
+from music_rllib.replay.trajectories import Trajectory
 from music_rllib.tac.algorithm import TACConfig
 from music_rllib.tac.diagnostics import NonFiniteLossError, of_updates
 from music_rllib.tac.learner import TACLearner
@@ -259,3 +261,28 @@ def test_action_l2_penalises_the_squashed_action(policy: str) -> None:
         torch.testing.assert_close(
             gradient, torch.full((ACTION,), expected / ACTION), atol=1e-5, rtol=0
         )
+
+
+@pytest.mark.parametrize("n_steps", [1, 3, 5])
+def test_exact_critics_of_n_step_targets_have_no_bias(n_steps: int) -> None:
+    """Rewards of 0: Q = gamma^n (alpha S + Q), with the entropy S of a constant policy."""
+    gamma, alpha, steps = 0.95, 0.05, 50
+    built = small_learner(
+        gym.spaces.Box(-np.inf, np.inf, (3,)), 4, 0, gamma=gamma, alpha=alpha, bootstrap="critics"
+    )
+    built.config.replay(n_steps=n_steps)
+    module = built._policy_module
+    for parameter in module.parameters():
+        parameter.data.zero_()
+    noise = torch.randn(100_000, 4, generator=torch.Generator().manual_seed(0))
+    zeros = torch.zeros(1)
+    entropy = -float(sample_squashed(zeros, zeros, noise).log_density.sum(-1).mean())
+    exact = gamma**n_steps * alpha * entropy / (1.0 - gamma**n_steps)
+    for critics in (module.critics, module.critics_target):
+        critics.biases[-1].data.fill_(exact)
+    frames, actions = np.zeros((steps + 1, 3), np.float32), np.zeros((steps, 4), np.float32)
+    episode = Trajectory(frames, actions, np.zeros(steps, np.float32), terminated=False)
+    built.metrics.reduce()
+    built.diagnose([episode] * 40, None)
+    logged = built.metrics.peek((DEFAULT_MODULE_ID, names.Q_BIAS))
+    assert logged == pytest.approx(0.0, abs=0.1)

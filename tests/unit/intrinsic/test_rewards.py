@@ -443,3 +443,14 @@ def test_a_bonus_that_depends_on_its_minibatch_says_so(name: str) -> None:
     with torch.no_grad():
         depends = not torch.allclose(reward.bonus(whole)[:8], reward.bonus(part), atol=1e-5)
     assert reward.by_minibatch == depends
+
+
+def test_rewards_have_the_type_of_the_states() -> None:
+    class Double(IntrinsicReward):
+        def bonus(self, batch: Batch) -> Tensor:
+            return (batch.followers - batch.states).double().abs().sum(-1)
+
+    states = torch.randn(8, 3)
+    batch = Batch(states, torch.zeros(8, 2), states + 1, torch.zeros(8, 0), torch.Generator())
+    reward, bonus = Double(Sizes(3, 0, 2)).reward(batch, learning=True)
+    assert reward.dtype == bonus.dtype == torch.float32
