@@ -25,15 +25,15 @@ from music_rllib.results.statistics import Array
 from music_rllib.results.study import study_of
 
 PRETRAINING = ("MUSIC-u (pretraining)", Style("#9a9a9a", "o"))
-NOT_IN_THE_PICTURE = (
-    "equal-entropy",
-    "equal-entropy-fixed",
-    "equal-entropy-slide",
-    "joint-pick",
-    "claims-pick-and-place",
-    "claims-slide",
+IN_THE_PICTURE = (
+    "joint-music",
+    "joint-pick-fresh",
+    "joint-slide",
+    "joint-her",
+    "claims-push",
+    "pick-and-place-in-80000-steps",
 )
-"""Studies whose task another subplot shows; six fit."""
+"""Studies with a subplot, six of which fit. The first row has those of the README's table."""
 SCRATCH = ("HER alone, q = 1", Style("#4d4d4d", "D", (6, 3)))
 (SUCCESS,) = (metric for metric in METRICS if metric.name == names.EVAL_SUCCESS)
 
@@ -79,13 +79,11 @@ def peers_figure(sweep: Sweep, figures: dict[str, Drawing]) -> Iterator[str]:
 
 
 def overview() -> bytes:
-    """A PNG of the complete studies, the one with the most seeds first."""
+    """A PNG of one complete study of each task, and of three others."""
     subplots: list[Subplot] = []
     entries: dict[str, Style] = {}
-    studies = sorted(complete_studies(), key=lambda pair: -pair[1].planned[0].contrast.seeds[0])
-    for sweep, study in studies:
-        if sweep.name in NOT_IN_THE_PICTURE:
-            continue
+    studies = {sweep.name: (sweep, study) for sweep, study in complete_studies()}
+    for sweep, study in (studies[name] for name in IN_THE_PICTURE if name in studies):
         legend = _legend(sweep)
         first = study.planned[0]
         curves = [_shifted(sweep, curve(sweep, c, first.task, SUCCESS.name)) for c in legend]
@@ -93,7 +91,8 @@ def overview() -> bytes:
         title = f"{first.task}, {first.contrast.seeds[0]} seeds\n{setting}"
         subplots.append(_subplot(title, curves, legend))
         entries |= dict(legend.values())
-    return files(subplots, list(entries.items()))[".png"]
+    ordered = sorted(entries.items(), key=lambda entry: not entry[0].startswith("q"))
+    return files(subplots, ordered)[".png"]
 
 
 def _legend(sweep: Sweep) -> dict[Condition, tuple[str, Style]]:
