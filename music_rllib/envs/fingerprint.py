@@ -31,7 +31,7 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from importlib.machinery import PathFinder
 from pathlib import Path, PurePosixPath
@@ -75,12 +75,13 @@ def fingerprint_of(
         found |= _fingerprint_of_modules(map(_imported, modules)) if modules else {}
         return found | _files_of_arguments(env_kwargs)
     register_robotics()
-    found = _fingerprint_of_modules([*_modules_of(env_id), *map(_imported, modules)])
-    return dict(sorted((found | _files_of_arguments(env_kwargs)).items()))
+    walk = _Walk(_relative_texts(env_kwargs))
+    found = _fingerprint_of_modules([*_modules_of(env_id), *map(_imported, modules)], walk)
+    return dict(sorted((found | _files_of_arguments(env_kwargs, walk.hashed)).items()))
 
 
-def _fingerprint_of_modules(modules: Iterable[str]) -> dict[str, str]:
-    walk = _Walk()
+def _fingerprint_of_modules(modules: Iterable[str], walk: _Walk | None = None) -> dict[str, str]:
+    walk = walk or _Walk()
     for module in modules:
         walk.visit(module, is_root=True)
     return walk.packages | walk.sources | walk.files()
@@ -145,14 +146,17 @@ def _modules_of(env_id: str) -> Iterator[str]:
 class _Walk:
     """The modules that an environment depends on, found by following imports."""
 
-    def __init__(self) -> None:
+    def __init__(self, texts: Iterable[str] = ()) -> None:
+        """`texts` may name files, as strings in the sources do."""
         self.packages: dict[str, str] = {}
         self.sources: dict[str, str] = {}
         self._seen: set[tuple[str, bool]] = set()
         self._folders: dict[Path, Path] = {}
         """Folder of each module or package -> folder from which it is imported."""
-        self._strings: set[str] = set()
-        """All strings in the sources, which may name files."""
+        self._strings = {*texts}
+        """All strings in the sources, and those given, which may name files."""
+        self.hashed: set[Path] = set()
+        """The files that `files` found."""
 
     def visit(self, name: str, *, is_root: bool = False) -> None:
         """Add a module, if one has this name, and what it imports."""
@@ -218,6 +222,7 @@ class _Walk:
         for path, name in wanted.items():
             with contextlib.suppress(OSError):  # deleted meanwhile, as a generated model may be
                 found_now[_FILE + name] = _hash_of(path)
+                self.hashed.add(path.resolve())
         return found_now
 
 
@@ -319,13 +324,25 @@ def _entries(folder: Path) -> Iterator[Path]:
                 yield path
 
 
-def _files_of_arguments(arguments: Any) -> dict[str, str]:
-    """Hashes of the files that an environment's arguments name."""
+def _relative_texts(arguments: Any) -> Iterator[str]:
+    """Strings of an environment's arguments that may name files beside its modules."""
+    if isinstance(arguments, str) and not arguments.startswith(("/", "~")):
+        yield arguments
+    elif isinstance(arguments, Mapping | list | tuple):
+        for one in arguments.values() if isinstance(arguments, Mapping) else arguments:
+            yield from _relative_texts(one)
+
+
+def _files_of_arguments(arguments: Any, known: Collection[Path] = ()) -> dict[str, str]:
+    """Hashes of the files that an environment's arguments name, without `known` ones.
+
+    A file beside the environment's module is found wherever the sweep is started.
+    """
     if isinstance(arguments, Mapping):
         arguments = list(arguments.values())
     if isinstance(arguments, list | tuple):
         found: dict[str, str] = {}
-        parts = (_files_of_arguments(one).items() for one in arguments)
+        parts = (_files_of_arguments(one, known).items() for one in arguments)
         for name, value in itertools.chain(*parts):
             # Files of different folders may have the same name.
             other = found.get(name, value)
@@ -337,7 +354,8 @@ def _files_of_arguments(arguments: Any) -> dict[str, str]:
         return {}
     path = Path(arguments).expanduser()
     try:
-        return {_FILE + path.name: _hash_of(path)} if path.is_file() else {}
+        is_new = path.is_file() and path.resolve() not in known
+        return {_FILE + path.name: _hash_of(path)} if is_new else {}
     except (OSError, ValueError):
         return {}
 

@@ -17,7 +17,7 @@ from music_rllib.envs.values import GOAL_KEYS
 
 _LOST = 0.05
 """Share of the range of some numbers from which on their rounding to float32 is reported."""
-_FEWEST_EPISODES = 3
+FEWEST_EPISODES = 3
 """Number of episodes with different goals that show what an observation contains."""
 
 
@@ -109,7 +109,7 @@ class PlayedValues:
                 "not keep their changes; leave out a constant part"
             )
         goals = np.array(self._goals)
-        if hindsight and len(np.unique(goals, axis=0)) >= _FEWEST_EPISODES:
+        if hindsight and len(np.unique(goals, axis=0)) >= FEWEST_EPISODES:
             entries = np.argwhere(self._holds & (np.ptp(goals, axis=0) > 0))
             lines += [
                 f"observation[{entry}] holds desired_goal[{of}] or its distance from the achieved "

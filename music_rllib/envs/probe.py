@@ -22,8 +22,8 @@ from music_rllib.envs.goal_functions import (
     goal_reward_of,
     moved_distance_of,
 )
-from music_rllib.envs.make import Env, make_env, reset_seed
-from music_rllib.envs.played_values import PlayedValues
+from music_rllib.envs.make import Env, episode_limit, make_env, reset_seed
+from music_rllib.envs.played_values import FEWEST_EPISODES, PlayedValues
 from music_rllib.envs.tasks import Task, closest
 from music_rllib.envs.values import (
     GOAL_KEYS,
@@ -122,11 +122,12 @@ class Probe:
         self._layout = ReplayLayout(size, int(action.shape[0]), goal, task.horizon)
         self._values = PlayedValues(env.observation_space, size, goal)
         self.problems += beyond_observation(task.agent_indices, task.surrounding_indices, size)
-        limit = env.spec.max_episode_steps if env.spec is not None else None
-        if limit is not None and task.horizon > limit:
+        if (limit := episode_limit(env, task.horizon)) < task.horizon:
+            # A registered function may return an environment with a limit inside, which this keeps.
+            raised = f"; env_kwargs: {{max_episode_steps: {task.horizon}}} would raise that"
             self.problems.append(
-                f"horizon must be <= {limit}, the environment's own limit, got {task.horizon}; "
-                f"env_kwargs: {{max_episode_steps: {task.horizon}}} would raise that"
+                f"horizon must be <= {limit}, the environment's own limit, got {task.horizon}"
+                f"{'' if 'max_episode_steps' in task.env_kwargs else raised}"
             )
         if self._hindsight and not goal:
             self.problems.append(
@@ -337,12 +338,13 @@ class Probe:
         second.close()
 
     def _play_more(self, env: Env) -> None:
-        """Play until the success key and, with hindsight, a second reward have been seen."""
+        """Play until the success key and, with hindsight, enough goals and rewards were seen."""
         end, number = time.monotonic() + MOST_SECONDS, 2
         key = self._task.success_key
         while self._steps < MOST_STEPS and time.monotonic() < end:
-            rewards_differ = self._reward is None or self._values.rewards_differ
-            if rewards_differ and (key is None or key in self._keys or self._misspelled()):
+            played = number - 2 >= FEWEST_EPISODES and self._values.rewards_differ
+            enough = self._reward is None or played
+            if enough and (key is None or key in self._keys or self._misspelled()):
                 break
             seed = reset_seed(np.random.SeedSequence(number), self._task.seed_range)
             self._play(env, seed, actions=number)

@@ -115,7 +115,8 @@ class OpenSweep:
     def continued_from(self, node: Node) -> int | None:
         """Environment steps of the finished shorter run that `node` would continue, if any."""
         key = continuation_key(node.run, node.source_key)
-        if budget_settings(node.run) or key not in self.existing[CONTINUATIONS]:
+        resumes = node.key in self.existing["work"] and self.store.work_folder(node.key).names()
+        if resumes or budget_settings(node.run) or key not in self.existing[CONTINUATIONS]:
             return None
         steps = [steps_of(name) for name in self.store.continuation(key).names()]
         return max((count for count in steps if count < node.run.env_steps), default=None)

@@ -24,7 +24,7 @@ from music_rllib.store.storage import (
     open_storage,
     sweep_folder,
 )
-from music_rllib.store.work_folder import WorkFolder
+from music_rllib.store.work_folder import WorkFolder, steps_of
 from music_rllib.sweep.driver_lock import drivers_of
 
 Item = dict[str, str]
@@ -109,6 +109,7 @@ def find_deletable(location: SweepLocation, *, unfinished: bool, everything: boo
     begun = {*(storage / "work").folders()}
     continued = {*(storage / CONTINUATIONS).folders()}
     cleaning = Cleaning(storage=storage)
+    interrupted = [one for one in nodes if one["key"] not in finished | pruned]
     for node in nodes:
         key, label = node["key"], node["label"]
         result = storage / "nodes" / key
@@ -130,6 +131,8 @@ def find_deletable(location: SweepLocation, *, unfinished: bool, everything: boo
             folder, what = storage / CONTINUATIONS / last, f"last checkpoint of {label}"
             if last in users:
                 cleaning.keep(folder.path, f"{what}: {', '.join(users[last])} has it too")
+            elif not unfinished and (waiting := _continues(folder, last, interrupted, storage)):
+                cleaning.keep(folder.path, f"{what}: {waiting} starts from it")
             else:
                 cleaning.add(folder, f"{what}: kept for a run with more env_steps")
         if everything and key in finished:
@@ -137,6 +140,18 @@ def find_deletable(location: SweepLocation, *, unfinished: bool, everything: boo
     if everything:
         _add_own_files(location, storage, cleaning)
     return cleaning
+
+
+def _continues(
+    folder: StorageFolder, key: str, nodes: Iterable[Mapping[str, Any]], storage: StorageFolder
+) -> str | None:
+    """The label of a run that would continue from the last checkpoint `key` in `folder`."""
+    steps = min(map(steps_of, WorkFolder(folder).names()), default=None)
+    for node in nodes if steps is not None else ():
+        longer = node.get("continuation") == key and node.get("env_steps", 0) > steps
+        if longer and not WorkFolder(storage / "work" / node["key"]).names():
+            return str(node["label"])
+    return None
 
 
 def _add_own_files(location: SweepLocation, storage: StorageFolder, cleaning: Cleaning) -> None:

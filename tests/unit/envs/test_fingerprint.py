@@ -208,3 +208,21 @@ def test_a_module_that_is_missing_or_hidden_is_named(
     (tmp_path / "queue.py").write_text("raise RuntimeError('hidden')")
     with pytest.raises(ImportError, match=r"'queue' of .* must have another name: Python has one"):
         make_env("queue:Lab-v0")
+
+
+@pytest.mark.parametrize("name", ["level.npy", "maps/level.npy"])
+def test_a_file_beside_the_module_counts_wherever_the_sweep_is_started(
+    name: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An environment opens `Path(__file__).parent / file`; `env_kwargs` has `file`."""
+    level = folder / "lab" / name
+    level.parent.mkdir(exist_ok=True)
+    level.write_text("1")
+    found = []
+    for place in (folder / "lab", level.parent, folder, Path("/")):
+        monkeypatch.chdir(place)
+        found.append(fingerprint_of("lab.envs:Lab-v0", {"file": name}))
+    assert [differences(found[0], one) for one in found[1:]] == [[], [], []]
+    level.write_text("2")
+    now_found = fingerprint_of("lab.envs:Lab-v0", {"file": name})
+    assert differences(found[0], now_found) == [f"lab/{name} changed"]

@@ -404,6 +404,13 @@ class Holds(Sound):
         return super().seen() | {"observation": np.array([self.at[0], self.goal[1] - self.at[1]])}
 
 
+class HoldsDense(Holds):
+    """Random steps have different rewards at once, so that few episodes are played."""
+
+    def compute_reward(self, achieved: Any, desired: Any, info: Any) -> Any:
+        return -np.linalg.norm(achieved - desired, axis=-1)
+
+
 class FarAway(Sound):
     def seen(self) -> Any:
         return super().seen() | {"observation": self.at + np.array([5.4e6, 0])}
@@ -443,6 +450,7 @@ class TorchGenerator(Sound):
         (TorchGenerator, "beside a second environment it differed from step 1 on"),
         (GlobalGenerator, "beside a second environment it differed from step 1 on"),
         (Holds, "observation[1] holds desired_goal[1] or its distance from the achieved goal"),
+        (HoldsDense, "observation[1] holds desired_goal[1] or its distance"),
         (FarAway, "observation[0] changes too little for its size: float32"),
         (Drawn, "a second environment's differed from step 1 on"),
         (
@@ -454,7 +462,7 @@ class TorchGenerator(Sound):
 def test_values_that_networks_cannot_learn_from_are_remarks(
     kind: type[Sound], remark: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = probed(monkeypatch, kind, hindsight=kind is Holds)
+    made = probed(monkeypatch, kind, hindsight=issubclass(kind, Holds))
     assert made.problems == []
     (line,) = made.remarks
     assert remark in line
@@ -492,3 +500,15 @@ def test_bool_goals_are_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
             return seen, float(reward), False, False, info
 
     assert probed(monkeypatch, Bools, hindsight=True).problems == []
+
+
+def test_a_limit_inside_is_the_environments_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A registered function returns a wrapped `gymnasium.make(...)`, whose limit stays."""
+
+    class Limited(Sound):
+        def __new__(cls) -> Any:
+            env = object.__new__(cls)
+            return gym.wrappers.TimeLimit(env, 10)
+
+    (line,) = probed(monkeypatch, Limited, env_kwargs={"max_episode_steps": 20}).problems
+    assert line == "horizon must be <= 10, the environment's own limit, got 20"

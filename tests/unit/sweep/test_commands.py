@@ -1193,3 +1193,24 @@ def test_an_empty_storage_is_refused(
 def test_the_last_line_of_a_watch_ends(storage: str, tmp_path: Path, program: Program) -> None:
     played(storage, tmp_path)
     assert program("status", f"{storage}/mine", "--watch").output.endswith("\n")
+
+
+def test_clean_keeps_the_last_checkpoint_from_which_a_run_of_the_plan_starts(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    sweep = played(storage, tmp_path)
+    node = sweep.plan.nodes[0]
+    last = sweep.store.continuation(continuation_key(node.run, node.source_key))
+    with last.new_checkpoint(4000) as new:
+        (new.folder / "x").touch()
+    longer = opened(storage, tmp_path, defaults={"env_steps": 8000})  # and interrupted at once
+    assert longer.continued_from(longer.plan.nodes[0]) == 4000
+    assert program("clean", f"{storage}/mine", "--yes").code == 0
+    assert last.names()
+    own = longer.store.work_folder(longer.plan.nodes[0].key)
+    with own.new_checkpoint(6000) as new:
+        (new.folder / "x").touch()
+    again = opened(storage, tmp_path, defaults={"env_steps": 8000})
+    assert again.continued_from(again.plan.nodes[0]) is None, "it resumes from its own"
+    assert program("clean", f"{storage}/mine", "--unfinished", "--yes").code == 0
+    assert not last.names()
