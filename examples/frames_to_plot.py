@@ -21,6 +21,7 @@ success = curves.query("stage == @stage and metric == primary_metric")
 figure, axes = plt.subplots(figsize=(6, 3.5), layout="constrained")
 for (task, condition), runs in success.groupby(["task", "condition"]):
     seeds = runs.pivot(index="env_steps", columns="seed", values="value")
+    seeds = seeds.interpolate("index", limit_area="inside")  # seeds may be evaluated at other steps
     label = f"{task}, {condition} (mean of {seeds.shape[1]} seeds)"
     (mean,) = axes.plot(seeds.mean(axis=1), label=label)
     axes.plot(seeds, color=mean.get_color(), linewidth=0.4)

@@ -5,6 +5,8 @@ Shape legend: K updates of a call, B transitions of one.
 
 from __future__ import annotations
 
+import posixpath
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, cast
 
@@ -24,6 +26,8 @@ PERIOD = 4
 minibatches, as RND does with many environments, and costs less than 40% of a small update."""
 
 _RESERVED = (names.INTRINSIC_REWARD, names.INTRINSIC_BONUS)
+_METRIC = re.compile(r"[\w .:/\-]{1,250}")
+"""Names that MLflow takes, apart from empty parts. It refuses the whole run for another one."""
 
 
 class RewardLearner:
@@ -120,6 +124,10 @@ class RewardLearner:
         for name in found:
             if not name.startswith("intrinsic/") or name in _RESERVED:
                 rule = "must begin with intrinsic/ and not be " + " or ".join(_RESERVED)
+                kind = type(self.reward).__name__
+                raise ValueError(f"names in {kind}.metrics {rule}, got {name!r}")
+            if not _METRIC.fullmatch(name) or posixpath.normpath(name) != name:
+                rule = "must be letters, digits, spaces and _-.:/ (at most 250, no empty part)"
                 kind = type(self.reward).__name__
                 raise ValueError(f"names in {kind}.metrics {rule}, got {name!r}")
         return found

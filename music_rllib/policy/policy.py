@@ -256,6 +256,8 @@ def _from_mlflow(uri: str, env: str | Sequence[Task]) -> Policy:
 def _local_copy(place: str) -> Iterator[Path]:
     """Yield a verified copy of a sealed folder; any other local folder or file as it is."""
     storage = open_storage(place)
+    if storage.is_local:  # the manifest has the name of the folder, not that of a link to it
+        storage = replace(storage, path=os.path.realpath(storage.path))
     parent, _, name = storage.path.rpartition("/")
     folders = SealedFolders(replace(storage, path=parent))
     if not folders.exists(name):

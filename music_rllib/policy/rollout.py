@@ -157,7 +157,7 @@ def _surroundings(policy: Policy, observation: Any) -> NDArray[Any] | None:
     if not indices:
         return None
     flat = observation["observation"] if policy.goal_size else observation
-    return np.asarray(flat)[indices]
+    return np.asarray(flat, np.float64)[indices]  # unsigned numbers would wrap around
 
 
 def _distance(observation: Any) -> float | None:

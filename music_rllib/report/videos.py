@@ -70,12 +70,14 @@ def make_videos(
         return Videos(missing="no run that was evaluated has finished")
     videos: list[Video] = []
     reasons: list[str] = []
-    for q, run in chosen:
+    for q, run in chosen[:MOST]:
         try:
             videos.append(_record(storage, run, q, environments))
         # An environment may raise anything, and no video is worth losing the report.
         except Exception as error:
             reasons.append(f"{run.name}: {first_line(error)}")
+    if left := ", ".join(f"q = {q}" for q, _ in chosen[MOST:]):
+        reasons.append(f"{left}: a report has at most {MOST} videos")
     return Videos(videos=videos, missing=reasons[0] if reasons else None)
 
 
@@ -90,7 +92,7 @@ def _median_runs(
     qs = list(dict.fromkeys(condition.entropic_index for condition in conditions))
     tasks = stage.tasks if len(qs) * len(stage.tasks) <= MOST else stage.tasks[:1]
     for task in tasks:
-        for q in qs[:MOST]:
+        for q in qs:
             rated = [
                 (rate, run)
                 for condition in conditions
@@ -102,7 +104,7 @@ def _median_runs(
             ]
             if rated:
                 _, median = sorted(rated)[len(rated) // 2]
-                yield sweep.runs[median].entropic_index, sweep.runs[median]
+                yield q or sweep.runs[median].entropic_index, sweep.runs[median]
 
 
 def _record(storage: str, run: RunRecord, q: str, environments: Sequence[Task]) -> Video:

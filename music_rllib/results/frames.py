@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +13,7 @@ import pandas as pd
 from music_rllib import names
 from music_rllib.results.analysis import analyse
 from music_rllib.results.archive import metrics_table
-from music_rllib.results.conditions import find_stages
+from music_rllib.results.conditions import ALL_TASKS, find_stages
 from music_rllib.results.data import Sweep
 from music_rllib.results.read import read_sweep
 
@@ -21,11 +22,16 @@ if TYPE_CHECKING:
 
 
 _SETTINGS = {
-    "q": (names.SETTING_ENTROPIC_INDEX, names.TAG_ENTROPIC_INDEX),
-    "alpha": (names.SETTING_ALPHA, names.TAG_ALPHA),
-    "mi_reward_weight": (names.SETTING_MI_REWARD_WEIGHT, names.TAG_MI_REWARD_WEIGHT),
+    "q": (names.SETTING_ENTROPIC_INDEX, "tac.entropic_index", names.TAG_ENTROPIC_INDEX),
+    "alpha": (names.SETTING_ALPHA, "tac.alpha", names.TAG_ALPHA),
+    "mi_reward_weight": (
+        names.SETTING_MI_REWARD_WEIGHT,
+        "music.mi_reward_weight",
+        names.TAG_MI_REWARD_WEIGHT,
+    ),
 }
-"""Settings that can be schedules: metric with the value at step 0, and tag with the words."""
+"""Settings that can be schedules: metric with the value at step 0, param, and tag with the words,
+whose numbers are rounded."""
 _RUN_COLUMNS = {
     **dict.fromkeys(("name", "stage", "variant", "task", "condition"), "str"),
     "seed": "Int64",
@@ -134,13 +140,22 @@ def _runs(sweep: Sweep, keys: list[str]) -> pd.DataFrame:
 
 
 def _at_start(sweep: Sweep, run: int, setting: str) -> float | None:
-    """A setting at step 0; of a run without a report the number at the beginning of its words."""
-    metric, tag = _SETTINGS[setting]
-    value = sweep.final(run, metric)
-    if value is None:
-        with suppress(ValueError):
-            return float(sweep.runs[run].tags.get(tag, "").split(" ")[0])
-    return value
+    """A setting at step 0; of a run without a report as its params, or else its words, have it."""
+    metric, param, tag = _SETTINGS[setting]
+    value, record = sweep.final(run, metric), sweep.runs[run]
+    if value is not None:
+        return value
+    for name in (param, f"{param}.value"):
+        for part in ("", ".initial", ".start"):
+            with suppress(KeyError, ValueError):
+                return float(record.params[f"{name}{part}"])
+        with suppress(LookupError, TypeError, ValueError):
+            # Until the first measurement, an entropy counts as the highest of the points.
+            falls = record.params.get(f"{name}.follows") == "shannon_entropy"
+            return float(json.loads(record.params[f"{name}.points"])[-1 if falls else 0][1])
+    with suppress(ValueError):
+        return float(record.tags.get(tag, "").split(" ")[0])
+    return None
 
 
 def _typed(texts: pd.Series[Any]) -> Any:
@@ -162,7 +177,10 @@ def _conditions(sweep: Sweep) -> Iterator[dict[str, Any]]:
         for scope in analysis.scopes:
             for final in scope.finals:
                 condition = final.condition
-                at_start = (_at_start(sweep, run, "q") for run in condition.runs)
+                own = [r for r in condition.runs if scope.name in (ALL_TASKS, sweep.runs[r].task)]
+                if scope.name == ALL_TASKS and not condition.entropic_index:
+                    own = []  # each task has its own q
+                at_start = (_at_start(sweep, run, "q") for run in own)
                 row = {
                     "stage": analysis.stage.name,
                     "variant": analysis.stage.variant,

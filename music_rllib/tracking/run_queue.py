@@ -216,6 +216,9 @@ class RunQueue:
             # A stage may have another name since, and a trial another number.
             tags = {**self._tags(), MLFLOW_RUN_NAME: self._info.name}
             self._experiment.correct(known, {key: tags[key] for key in _PLACE if key in tags})
+            if names.TAG_PART in known.tags and names.TAG_PART not in tags:  # of a search no longer
+                self._experiment.remove_tag(known.run_id, names.TAG_PART)
+                del known.tags[names.TAG_PART]
             return
         stored = read()
         self._read_policy = stored.read_policy

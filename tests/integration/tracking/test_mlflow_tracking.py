@@ -420,8 +420,9 @@ def test_a_reused_node_is_logged_once(storage: Path, tracker_on: MakeTracker) ->
     tracker = tracker_on()
     code = {names.TAG_GIT_COMMIT: "of its training"}
     of_store = StoredRun([report(step, time=step) for step in STEPS], provenance=code)
-    tracker.mirror(run_info("old"), stored(STEPS))
-    tracker.mirror(run_info("old"), lambda: of_store)
+    trial = run_info("old", tags={names.TAG_PART: "trial3"})
+    tracker.mirror(trial, stored(STEPS))
+    tracker.mirror(trial, lambda: of_store)
     tracker.start(run_info("new", source_node="old"))
     tracker.log("new", later([2000]))
     tracker.mirror(run_info("new", source_node="old"), lambda: StoredRun(later([2000])))
@@ -432,7 +433,7 @@ def test_a_reused_node_is_logged_once(storage: Path, tracker_on: MakeTracker) ->
     def read() -> StoredRun:
         raise AssertionError("MLflow has all of it")
 
-    # Its stage has another name now.
+    # Its stage has another name now, and is no search.
     place = {names.TAG_STAGE: "renamed", names.TAG_TRIAL: 3}
     again.mirror(run_info("old", name="renamed/old", tags=place), read)
     assert not again.close()
@@ -442,6 +443,7 @@ def test_a_reused_node_is_logged_once(storage: Path, tracker_on: MakeTracker) ->
     runs = runs_of(client)
     old, new = runs["renamed/old"], runs["finetune/new"]
     assert (old.data.tags[names.TAG_STAGE], old.data.tags[names.TAG_TRIAL]) == ("renamed", "3")
+    assert names.TAG_PART not in old.data.tags
     assert logged_steps(client, old) == STEPS
     assert old.data.tags[names.TAG_GIT_COMMIT] == "of its training"
     assert (old.info.start_time, old.info.end_time) == (1_700_002_000_000, 1_700_020_000_000)

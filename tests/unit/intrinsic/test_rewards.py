@@ -454,3 +454,17 @@ def test_rewards_have_the_type_of_the_states() -> None:
     batch = Batch(states, torch.zeros(8, 2), states + 1, torch.zeros(8, 0), torch.Generator())
     reward, bonus = Double(Sizes(3, 0, 2)).reward(batch, learning=True)
     assert reward.dtype == bonus.dtype == torch.float32
+
+
+@pytest.mark.parametrize(
+    "name", ["intrinsic/error (mean)", "intrinsic//x", "intrinsic/", "intrinsic/" + "x" * 250]
+)
+def test_names_that_mlflow_refuses(name: str) -> None:
+    class Reward:
+        def metrics(self) -> dict[str, float]:
+            return {name: 1.0}
+
+    learner = RewardLearner.__new__(RewardLearner)
+    vars(learner)["reward"] = Reward()
+    with pytest.raises(ValueError, match=r"names in Reward\.metrics"):
+        learner.metrics()

@@ -5,16 +5,20 @@ import json
 import pickle
 import shutil
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 
 from music_rllib.config.run_settings import RunSettings
-from music_rllib.envs.tasks import BUILT_IN_TASKS
+from music_rllib.envs.tasks import BUILT_IN_TASKS, Task
 from music_rllib.policy import PolicyError, PolicyNetwork, find_policy, load_policy, policy
 from music_rllib.policy.network import PolicyFileError
+from music_rllib.policy.rollout import open_task, play
 from music_rllib.store.handoff import Spaces, write_handoff
 from music_rllib.store.sealed import SealedFolders
 from music_rllib.store.storage import open_storage
@@ -210,6 +214,8 @@ def test_a_published_node_is_verified(tmp_path: Path) -> None:
     node = tmp_path / "nodes" / KEY
     assert load_policy(node).node_key == KEY
     assert load_policy(node.as_uri()).node_key == KEY
+    (tmp_path / "latest").symlink_to(node)
+    assert load_policy(tmp_path / "latest").node_key == KEY
     manifest = json.loads((node / "handoff" / "handoff.json").read_text())
     manifest["info"]["observation_clip"] = 0.1
     (node / "handoff" / "handoff.json").write_text(json.dumps(manifest))
@@ -289,3 +295,59 @@ def test_a_damaged_manifest_is_not_taken_for_a_folder_of_several(tmp_path: Path)
     (tmp_path / "handoff" / "handoff.json").write_text("{}")
     with pytest.raises(PolicyError, match=r"handoff.json must be a handoff manifest"):
         load_policy(tmp_path)
+
+
+class Cells(gym.Env[Any, Any]):
+    """Two cells that go from 1 to 0."""
+
+    action_space = spaces.Box(-1.0, 1.0, (1,))
+
+    def __init__(self, kind: Any) -> None:
+        self.kind: Any = np.dtype(kind)
+        self.observation_space = spaces.Box(0, 1, (2,), self.kind)
+
+    def reset(self, **options: Any) -> Any:
+        return np.ones(2, self.kind), {}
+
+    def step(self, action: Any) -> Any:
+        return np.zeros(2, self.kind), 0.0, False, False, {}
+
+
+@pytest.mark.parametrize("kind", ["float32", "uint8", "bool"])
+def test_the_displacement_of_any_type_of_observation(
+    tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    of_cells = EnvSpec("Cells-v0", cast("Any", Cells), max_episode_steps=2)
+    monkeypatch.setitem(gym.registry, "Cells-v0", of_cells)
+    task = Task(
+        name="C",
+        env_id="Cells-v0",
+        horizon=2,
+        success_key=None,
+        env_kwargs={"kind": kind},
+        agent_indices=(0,),
+        surrounding_indices=(1,),
+    )
+    about = {
+        "task": task.model_dump(mode="json"),
+        "variant": "tac",
+        "seed": 0,
+        "node_key": "0" * 20,
+        "env_steps": 1,
+        "max_episode_steps": 2,
+    }
+    one, two = np.ones(1, np.float32), np.ones(2, np.float32)
+    network = PolicyNetwork(
+        weights=(np.zeros((1, 2), np.float32),),
+        biases=(0 * one,),
+        mean=0 * two,
+        inverse_std=two,
+        clip=5.0,
+        low=-one,
+        high=one,
+        goal_size=0,
+        about=about,
+    )
+    (tmp_path / "p").write_bytes(network.to_bytes())
+    policy = load_policy(tmp_path / "p", [task])
+    assert next(play(policy, open_task(policy), 1, 0)).object_displacement == 1.0

@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import ast
 import json
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
 import matplotlib as mpl
+import numpy as np
 import pandas as pd
 import pytest
 
 from music_rllib import load_sweep, names
 from music_rllib.errors import BadInputError
+from music_rllib.experiment.plan import make_plan
 from music_rllib.results.archive import Format, read_archive, write_archive
-from music_rllib.results.data import Points, ReportError, columns
+from music_rllib.results.data import LastValues, Points, ReportError, Sweep, columns
 from music_rllib.results.frames import frames_of
 from music_rllib.results.read import read_sweep
+from music_rllib.store.history import RunResult
+from tests.sweep_files import loaded
 
 DOCS = Path(__file__).parents[3] / "docs"
 EXPORT = DOCS / "results" / "data" / "v3-fetch-push-music-f"
@@ -160,3 +165,78 @@ def test_an_export_on_a_full_disk_keeps_the_earlier_one(
     with pytest.raises(ReportError, match="No space left"):
         write_archive(replace(read_archive(EXPORT), runs=[], history={}), tmp_path)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def of_stage(
+    folder: Path, stage: dict[str, Any], tasks: Iterable[str] = ("FetchPush",), *, done: bool = True
+) -> Sweep:
+    """A sweep of two seeds whose runs have finished, or have no report yet."""
+    plan = make_plan(
+        loaded(
+            folder,
+            {
+                "name": "s",
+                "tasks": list(tasks),
+                "seeds": 2,
+                "stages": [{"name": "train", "variant": "tac", **stage}],
+            },
+        )
+    )
+    values = {names.EVAL_SUCCESS: 0.5, names.EVAL_EPISODES: 20.0}
+    results = {
+        n.key: RunResult(label=n.label, env_steps=n.run.env_steps, seconds=1.0, metrics=values)
+        for n in plan.nodes
+    }
+    return LastValues(plan).sweep(results if done else {})
+
+
+def test_a_task_s_condition_has_its_own_q(tmp_path: Path) -> None:
+    qs = {"FetchPush": 1.0, "FetchSlide": 2.0}
+    stage: dict[str, Any]
+    stage = {"per_task": {task: {"tac": {"entropic_index": q}} for task, q in qs.items()}}
+    found = frames_of(of_stage(tmp_path, stage, qs)).conditions.set_index("task")["q"]
+    assert {task: found[task] for task in qs} == qs
+    assert np.isnan(found["all tasks"])
+    stage = {"grid": {"tac.entropic_index": [1.5]}}
+    assert set(frames_of(of_stage(tmp_path, stage, qs)).conditions["q"]) == {1.5}
+
+
+@pytest.mark.parametrize(
+    ("setting", "q", "alpha"),
+    [
+        (
+            {"entropic_index": {"follows": "shannon_entropy", "points": [[-4.0, 2.0], [2.0, 1.0]]}},
+            1.0,
+            0.2,
+        ),
+        (
+            {"entropic_index": {"follows": "success_rate", "points": [[0.0, 2.0], [1.0, 1.0]]}},
+            2.0,
+            0.2,
+        ),
+        ({"alpha": 0.123456789}, 1.0, 0.123456789),
+        ({"alpha": {"learned": True, "initial": 0.3}}, 1.0, 0.3),
+        ({"alpha": {"schedule": "linear", "start": 0.1234567, "end": 0.1}}, 1.0, 0.1234567),
+        (
+            {"alpha": {"schedule": "piecewise", "points": [[0, 0.1234567], [5, 0.1]]}},
+            1.0,
+            0.1234567,
+        ),
+        ({"alpha": {"value": 0.1234567, "matched_width": 0.3}}, 1.0, 0.1234567),
+        (
+            {
+                "alpha": {
+                    "value": {"schedule": "piecewise", "points": [[0, 0.1234567], [5, 0.1]]},
+                    "matched_width": 0.3,
+                }
+            },
+            1.0,
+            0.1234567,
+        ),
+    ],
+)
+def test_a_run_without_a_report_has_its_initial_settings(
+    tmp_path: Path, setting: dict[str, Any], q: float, alpha: float
+) -> None:
+    frame = frames_of(of_stage(tmp_path, {"tac": setting}, done=False)).runs
+    assert (set(frame.q), set(frame.alpha)) == ({q}, {alpha})
