@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal, Self
 
@@ -56,6 +57,24 @@ Line = Annotated[str, Field(max_length=100_000, pattern=r"^[^\x00-\x1f\x7f]*$")]
 """Plans may come from strangers: text without control characters, which a terminal would obey."""
 
 
+@dataclass(frozen=True)
+class PlannedHypothesis:
+    """A hypothesis of a plan, equal to one that says the same, with or without a default stage."""
+
+    meaning: Hashable = field(repr=False)
+    text: str = field(compare=False)
+    stages: frozenset[str] = field(compare=False)
+    """The stages that it compares."""
+
+    @classmethod
+    def of(cls, text: str, stage: str) -> PlannedHypothesis:
+        """The hypothesis `text` of a plan whose default stage is `stage`."""
+        relation, sides = Hypothesis.of(text).relation, Hypothesis.of(text).sides
+        whole = [{"stage": stage, **side} for side in sides]
+        meaning = (relation, *(frozenset(side.items()) for side in whole))
+        return cls(meaning, text, frozenset(side["stage"] for side in whole))
+
+
 class AnalysisPlan(StrictModel, strict=True):
     """A question, and everything needed to decide it."""
 
@@ -81,13 +100,13 @@ class AnalysisPlan(StrictModel, strict=True):
         return self
 
     @property
-    def stages(self) -> frozenset[str]:
-        return _stages_of(self.hypotheses, self.stage)
+    def planned(self) -> tuple[PlannedHypothesis, ...]:
+        """The hypotheses, without those that repeat an earlier one."""
+        return tuple(dict.fromkeys(PlannedHypothesis.of(t, self.stage) for t in self.hypotheses))
 
     @property
-    def stages_of_hypotheses(self) -> dict[str, frozenset[str]]:
-        """The stages that each hypothesis compares."""
-        return {text: _stages_of([text], self.stage) for text in self.hypotheses}
+    def stages(self) -> frozenset[str]:
+        return frozenset[str]().union(*(one.stages for one in self.planned))
 
     def seeds_of(self, stage: str) -> str:
         """The seeds of a stage in words."""
@@ -113,11 +132,6 @@ class AnalysisPlan(StrictModel, strict=True):
         """Whether this is `other`, possibly for a subset of its seeds."""
         own, others = (set(plan.seeds.split(", ")) for plan in (self, other))
         return own <= others and self == other.model_copy(update={"seeds": self.seeds})
-
-
-def _stages_of(hypotheses: Sequence[str], default: str) -> frozenset[str]:
-    sides = [side for text in hypotheses for side in Hypothesis.of(text)[1:3]]
-    return frozenset(side.get("stage", default) for side in sides)
 
 
 class PlanVersion(StrictModel, strict=True):
@@ -192,7 +206,8 @@ def analysis_plan(config: SweepConfig) -> AnalysisPlan | None:
     if analysis is None:
         return None
     default = analysis.stage or config.stages[-1].name
-    about = _stages_of(analysis.hypotheses, default)
+    planned = [PlannedHypothesis.of(text, default) for text in analysis.hypotheses]
+    about = frozenset[str]().union(*(one.stages for one in planned))
     stages = [stage for stage in config.stages if stage.name in about]
     metrics = sorted({task.primary_metric for stage in stages for task in stage.tasks})
     margin = analysis.margin
@@ -321,7 +336,7 @@ def record_plan(sweep: OpenSweep) -> tuple[Sequence[PlanVersion], tuple[str, ...
     done = {node.stage for node in sweep.plan.nodes if node.key in sweep.finished}
     known = [one.plan for one in before if plan.has_same_test(one.plan)]
     return versions, tuple(
-        text
-        for text, of in plan.stages_of_hypotheses.items()
-        if of & done and not any(one.stages_of_hypotheses.get(text) == of for one in known)
+        hypothesis.text
+        for hypothesis in plan.planned
+        if hypothesis.stages & done and not any(hypothesis in one.planned for one in known)
     )

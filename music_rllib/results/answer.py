@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from music_rllib import names
-from music_rllib.results.analysis_plan import AnalysisPlan, is_controlled
+from music_rllib.results.analysis_plan import AnalysisPlan, PlannedHypothesis, is_controlled
 from music_rllib.results.claims import FEWEST_SEEDS, Claim, Verdict
 from music_rllib.results.conditions import ALL_TASKS, Condition
 from music_rllib.results.data import Sweep
@@ -24,7 +24,7 @@ from music_rllib.results.statistics import (
     p_text,
     seeds_needed,
 )
-from music_rllib.results.study import Mean, Study
+from music_rllib.results.study import MOST_CONDITIONS, Mean, Study
 
 MOST_CLAIMS = 4
 """Number of claims with a sentence of their own; the others are in the table."""
@@ -47,11 +47,7 @@ def answer(sweep: Sweep, study: Study) -> list[str]:
             "No planned comparison can be tested yet; the table has the exploratory ones."
         )
     elif not shown:
-        only = study.means[0]
-        sentences.append(
-            f"Only one condition has a result: {only.condition.short_label}, {only.measure.words} "
-            f"{number(only.estimate.value)} ({mean_interval(only.estimate)})."
-        )
+        sentences.append(_single_means(study.means))
     if rest := [claim for claim in study.claims if claim not in shown[:MOST_CLAIMS]]:
         counts = Counter(str(claim.verdict) for claim in rest)
         verdicts = ", ".join(f"{n} {verdict}" for verdict, n in counts.items())
@@ -59,8 +55,9 @@ def answer(sweep: Sweep, study: Study) -> list[str]:
     sentences += [_metric(study, shown), _seeds(sweep, study, shown)]
     sentences.append(f"Control: {_control(sweep, study)}.")
     undecided = (Verdict.UNDECIDED, Verdict.NONE)
-    if any(claim.verdict in undecided and not claim.unfinished for claim in study.claims):
-        alike = _alike(shown)
+    alike = _alike(shown)
+    own = (claim for claim in study.claims if _is_alike(claim, alike))
+    if any(claim.verdict in undecided and not claim.unfinished for claim in own):
         means = [one for one in study.means if _is_alike(one, alike)]
         sentences += filter(None, [power_in_words(alike, means, study.family)])
     return [*sentences, *(f"Not tested: {text}." for text in study.untested[:1])]
@@ -109,7 +106,10 @@ def planned_in_words(study: Study) -> str:
         return f"{text}; changed afterwards: {names_of_fields}" if changed else text
     if latest is not None:
         return f"recorded {latest.recorded}, after the first run had finished: not planned"
-    return "no comparison was planned in advance: all pairs of conditions are compared"
+    which = "all pairs of conditions are compared"
+    if study.stage is not None and len(study.stage.compared) > MOST_CONDITIONS:
+        which = "each condition is compared with a reference"
+    return f"no comparison was planned in advance: {which}"
 
 
 def _changed(before: AnalysisPlan, after: AnalysisPlan) -> list[str]:
@@ -118,11 +118,11 @@ def _changed(before: AnalysisPlan, after: AnalysisPlan) -> list[str]:
     return [name.replace("_", " ") for name in known if known[name] != now[name]]
 
 
-def _changed_tests(hypothesis: str, before: AnalysisPlan, after: AnalysisPlan) -> Iterator[str]:
+def _changed_tests(
+    hypothesis: PlannedHypothesis, before: AnalysisPlan, after: AnalysisPlan
+) -> Iterator[str]:
     """What a later version changes in the test of a hypothesis; further stages change nothing."""
-    if any(
-        before.seeds_of(s) != after.seeds_of(s) for s in before.stages_of_hypotheses[hypothesis]
-    ):
+    if any(before.seeds_of(stage) != after.seeds_of(stage) for stage in hypothesis.stages):
         yield "seeds"
     yield from (
         name for name in ("metric", "margin") if getattr(before, name) != getattr(after, name)
@@ -186,10 +186,29 @@ def numbers_in_words(claim: Claim) -> str:
     return f"{gap} ({'; '.join(filter(None, (interval_in_words(claim), p_in_words(claim))))})"
 
 
+def _single_means(means: Sequence[Mean]) -> str:
+    """The results of conditions of which no two can be compared on a task."""
+    tasks = dict.fromkeys(mean.task for mean in means)
+    start = "Only one condition has a result"
+    if len({mean.condition for mean in means}) > 1:
+        start = "No two conditions have results on the same task"
+    texts = (
+        f"{mean.condition.short_label}{f' on {mean.task}' if len(tasks) > 1 else ''}, "
+        f"{mean.measure.words} {number(mean.estimate.value)} ({mean_interval(mean.estimate)})"
+        for mean in means[:MOST_CLAIMS]
+    )
+    return f"{start}: {'; '.join(texts)}."
+
+
 def _metric(study: Study, shown: Sequence[Claim]) -> str:
-    measure = (shown[0] if shown else study.means[0]).measure
-    area = " (area under the learning curve)" if measure.kind != "final" else ""
-    text = f"Metric: {measure.words}{area}"
+    tasks: dict[str, dict[str, None]] = {}
+    for one in shown or study.means:
+        area = " (area under the learning curve)" if one.measure.kind != "final" else ""
+        tasks.setdefault(f"{one.measure.words}{area}", {})[one.task] = None
+    several = len(tasks) > 1
+    text = "Metric: " + "; ".join(
+        f"{words} on {' and '.join(of)}" if several else words for words, of in tasks.items()
+    )
     # A margin of success rates does not apply to returns.
     margins = {one.margin for one in _alike(shown) if one.margin is not None}
     if margins:

@@ -66,7 +66,8 @@ class Contrast:
     p_equivalent: Array | None
     """p-value of a difference of the margin or more; None without a margin."""
     spread: Array
-    """Standard deviation of a difference between single seeds; NaN if unknown."""
+    """Standard deviation of a difference between single seeds, at least that of their evaluation
+    episodes; NaN if unknown."""
     paired: bool
     seeds: tuple[int, int]
     collapsed: Array
@@ -106,6 +107,8 @@ def contrast(
     spread = error = freedom = np.full(value.shape, np.nan)
     if min(len(x), len(y)) >= 2:
         spread, error, freedom = _student(x, y, paired)
+        # More seeds reduce an error that comes from the episodes at the same rate.
+        spread = spread * np.maximum(1.0, noise / np.where(error > 0, error, np.inf))
         error = np.maximum(error, noise)
         scale = np.maximum(np.abs(x).max(axis=0), np.abs(y).max(axis=0))
         error = np.where(error > _TIED * scale, error, np.nan)

@@ -18,7 +18,7 @@ import numpy as np
 from music_rllib import names
 from music_rllib.config.schema import Hypothesis, same_value
 from music_rllib.results import statistics as st
-from music_rllib.results.analysis_plan import PlanVersion
+from music_rllib.results.analysis_plan import PlannedHypothesis, PlanVersion
 from music_rllib.results.claims import Claim, Pairs, claims_of, decided, exploratory
 from music_rllib.results.conditions import (
     ALPHA,
@@ -59,7 +59,7 @@ class Study:
     """None before a run has started, and without a stage that trains for the task."""
     plan: PlanVersion | None
     """The last version that planned a hypothesis in time; None without one."""
-    before: Mapping[str, PlanVersion]
+    before: Mapping[PlannedHypothesis, PlanVersion]
     """Hypotheses that an earlier version planned in time, and this version."""
     latest: PlanVersion | None
     means: tuple[Mean, ...]
@@ -125,14 +125,14 @@ def study_of(
         planned += _of_plan(sweep, stages, version, own, untested)
     without_test = sum(untested.values())
     unplanned: list[Claim] = []
-    late: list[_Key] = []
+    late: list[PlannedHypothesis] = []
     if latest is not None:
-        keys = latest.plan.stages_of_hypotheses.items()
-        late = [key for key in keys if key not in in_time]
+        now = latest.plan.planned
+        late = [one for one in now if one not in in_time]
         again = [
-            key
-            for key in keys
-            if key in in_time and not latest.plan.has_same_test(in_time[key].plan)
+            one
+            for one in now
+            if one in in_time and not latest.plan.has_same_test(in_time[one].plan)
         ]
         why = "exploratory: runs of it had finished before the plan" if plan else ""
         of_late = _of_plan(sweep, stages, latest, late, untested)
@@ -157,20 +157,22 @@ def study_of(
             rates = {measure.metric for measure in measures.values()}
             without_test = len(pairs) * _scopes(chosen.tasks, rates) - len(of_stage)
     of_plan = [
-        one for name, one in stages.items() if any(name in of for _, of in (*in_time, *late))
+        found
+        for name, found in stages.items()
+        if any(name in one.stages for one in (*in_time, *late))
     ]
     compared = [run for one in filter(None, [chosen, *of_plan]) for run in _runs(one)]
     return Study(
         stage=chosen,
         plan=plan,
-        before={text: one for (text, _), one in in_time.items() if one is not plan},
+        before={key: one for key, one in in_time.items() if one is not plan},
         latest=latest,
         means=tuple(means),
-        late=tuple(text for text, _ in late),
+        late=tuple(one.text for one in late),
         dropped=tuple(
-            _in_full(text, one, latest).text
-            for (text, of), one in in_time.items()
-            if latest is not None and (text, of) not in latest.plan.stages_of_hypotheses.items()
+            _in_full(key.text, one, latest).text
+            for key, one in in_time.items()
+            if latest is not None and key not in latest.plan.planned
         ),
         planned=decided(planned, planned=True, without_test=without_test),
         unplanned=(
@@ -189,24 +191,21 @@ def _runs(stage: StageRuns) -> list[int]:
     return [run for condition in stage.compared for run in condition.runs]
 
 
-_Key = tuple[str, frozenset[str]]
-"""A hypothesis, and the stages that it compares."""
-
-
-def _planned_in_time(sweep: Sweep, stages: Mapping[str, StageRuns]) -> dict[_Key, PlanVersion]:
+def _planned_in_time(
+    sweep: Sweep, stages: Mapping[str, StageRuns]
+) -> dict[PlannedHypothesis, PlanVersion]:
     """The hypotheses that were planned, with the version by which they are tested.
 
     This is the last version that was recorded before the first result of the hypothesis's stages. A
     hypothesis that it lacks was withdrawn in time, or came too late.
     """
-    found: dict[_Key, PlanVersion] = {}
-    every = (key for one in sweep.plans for key in one.plan.stages_of_hypotheses.items())
-    for text, of in dict.fromkeys(every):
-        runs = (run for name in of & stages.keys() for run in stages[name].runs)
+    found: dict[PlannedHypothesis, PlanVersion] = {}
+    for key in dict.fromkeys(key for one in sweep.plans for key in one.plan.planned):
+        runs = (run for name in key.stages & stages.keys() for run in stages[name].runs)
         time = first_result(sweep, runs)
         before = [version for version in sweep.plans if version.recorded_ms < time]
-        if before and before[-1].plan.stages_of_hypotheses.get(text) == of:
-            found[text, of] = before[-1]
+        for version in before[-1:]:
+            found |= {one: version for one in version.plan.planned if one == key}
     return found
 
 
@@ -219,7 +218,7 @@ def _of_plan(
     sweep: Sweep,
     stages: Mapping[str, StageRuns],
     version: PlanVersion,
-    hypotheses: Sequence[_Key],
+    hypotheses: Sequence[PlannedHypothesis],
     untested: dict[str, int],
 ) -> Iterator[Claim]:
     """The undecided claims of some of a plan's hypotheses.
@@ -228,9 +227,9 @@ def _of_plan(
     """
     plan = version.plan
     sweep = counted(sweep, plan.metric) if hypotheses else sweep
-    for text, of in hypotheses:
-        hypothesis = _in_full(text, version, sweep.plans[-1])
-        tasks = _tasks_of_all(sweep, of, plan.budget.keys())
+    for key in hypotheses:
+        hypothesis = _in_full(key.text, version, sweep.plans[-1])
+        tasks = _tasks_of_all(sweep, key.stages, plan.budget.keys())
         scopes = _scopes(tasks, {sweep.primary_metric(task) for task in tasks})
         sides = (hypothesis.first, hypothesis.second)
         first, second = (_matching(sweep, stages, side, plan.stage) for side in sides)

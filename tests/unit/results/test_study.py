@@ -1224,3 +1224,77 @@ def test_an_alpha_of_each_task_is_not_averaged_over(tmp_path: Path) -> None:
     ]
     sweep = sweep_of(runs)
     assert f"Control: {text}." in answer(sweep, study_of(sweep))
+
+
+def test_seeds_needed_count_the_error_of_the_episodes() -> None:
+    x = np.array([0.30, 0.31, 0.29, 0.30, 0.32, 0.30, 0.31, 0.30])
+    y = np.array([0.30, 0.30, 0.30, 0.31, 0.31, 0.30, 0.30, 0.31])
+    for paired in (True, False):
+        found = contrast(x, y, paired=paired, margin=0.05, noise=0.025)
+        np.testing.assert_allclose(found.spread, 0.025 * np.sqrt(8))
+        wide = contrast(x, y, paired=paired, margin=0.05, noise=1e-6)
+        np.testing.assert_allclose(
+            wide.spread, (x - y).std(ddof=1) if paired else np.hypot(x.std(ddof=1), y.std(ddof=1))
+        )
+
+
+def of_return(task: str, budget: int, rng: np.random.Generator) -> list[tuple[RunRecord, Points]]:
+    """Runs of a task without success."""
+    made = cells(rng, 6, ("1", 0.3), ("1.5", 0.3), task=task)
+    return [
+        (
+            replace(r, params={**r.params, "task.success_key": "None", "env_steps": str(budget)}),
+            p._replace(
+                metrics=[{names.EVAL_SUCCESS: names.EVAL_RETURN}.get(m, m) for m in p.metrics]
+            ),
+        )
+        for r, p in made
+    ]
+
+
+def test_the_metric_of_each_task_is_named() -> None:
+    rng = np.random.default_rng(0)
+    runs = cells(rng, 6, ("1", 0.2), ("1.5", 0.3)) + of_return("Swing", 8000, rng)
+    sweep = sweep_of(runs)
+    said = answer(sweep, study_of(sweep))
+    area = "(area under the learning curve)"
+    start = (
+        f"Metric: mean success over 10,000 steps {area} on FetchPush; "
+        f"mean return over 8,000 steps {area} on Swing; equivalence margin 0.05"
+    )
+    assert any(line.startswith(start) for line in said)
+    assert "standard deviation" not in " ".join(said), "only the return is undecided"
+
+
+def test_a_single_condition_has_its_result_on_each_task() -> None:
+    rng = np.random.default_rng(0)
+    runs = cells(rng, 5, ("1", 0.2)) + cells(rng, 5, ("1", 0.4), task="FetchSlide")
+    line = answer(sweep_of(runs), study_of(sweep_of(runs)))[1]
+    assert "q = 1 on FetchPush, mean success over 10,000 steps 0.2" in line
+    assert "q = 1 on FetchSlide, mean success over 10,000 steps 0.4" in line
+
+
+def test_many_conditions_are_not_all_compared() -> None:
+    runs = cells(np.random.default_rng(0), 5, *[(f"{q:g}", 0.3) for q in np.arange(1, 2.4, 0.2)])
+    said = answer(sweep_of(runs), study_of(sweep_of(runs)))[0]
+    assert said.endswith("planned in advance: each condition is compared with a reference.")
+
+
+def test_a_hypothesis_that_later_names_its_stage_is_the_same() -> None:
+    rng = np.random.default_rng(0)
+    her = cells(rng, 6, ("1", 0.2), ("2", 0.3), stage="her")
+    train = [
+        (one, points._replace(times=[DONE + 5] * len(points.times)))
+        for one, points in cells(rng, 6, ("1", 0.25), ("2", 0.3), stage="train")
+    ]
+    short, full = "q = 2 against q = 1", "stage = her, q = 2 against stage = her, q = 1"
+    versions = with_plan((), plan(short, stage="her"), DONE - 1)
+    versions = with_plan(versions, plan(full, short, stage="train"), DONE + 1)
+    found = study_of(sweep_of([*her, *train], versions))
+    assert (found.late, found.dropped, found.unplanned) == ((), (), ())
+    assert [one.hypothesis and one.hypothesis.sides[0] for one in found.planned] == [
+        {"stage": "her", "tac.entropic_index": "2"},
+        {"tac.entropic_index": "2"},
+    ]
+    once = with_plan((), plan(full, short, stage="her"), DONE - 1)
+    assert study_of(sweep_of(her, once)).family == 1
