@@ -6,7 +6,7 @@ import base64
 import hashlib
 import statistics
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
@@ -24,7 +24,7 @@ from music_rllib.report.figures.draw import inline
 from music_rllib.report.videos import Videos
 from music_rllib.results.analysis import StageAnalysis
 from music_rllib.results.answer import answer, planned_in_words
-from music_rllib.results.conditions import SIDE_BY_SIDE, StageRuns
+from music_rllib.results.conditions import SIDE_BY_SIDE
 from music_rllib.results.data import Sweep
 from music_rllib.results.search_tables import search_in_words, search_tables
 from music_rllib.results.study import Study
@@ -186,10 +186,16 @@ def _question(report: SweepReport) -> str:
     stage = report.study.stage or report.analyses[-1].stage
     metrics = dict.fromkeys(names.word_of(report.sweep.primary_metric(t)) for t in stage.tasks)
     aim = " or ".join("success rate" if word == "success" else word for word in metrics)
-    budgets = [budget for run in stage.runs if (budget := report.sweep.runs[run].budget)]
-    steps = f", {statistics.median(budgets):,.0f} environment steps per run" if budgets else ""
-    where = f"on {_enumerated(stage.tasks)} ({_seeds(stage)}{steps})"
-    labels = [condition.short_label for condition in stage.compared or stage.conditions]
+    compared = stage.compared or stage.conditions
+    runs = [report.sweep.runs[run] for condition in compared for run in condition.runs]
+    budgets = [budget for run in runs if (budget := run.budget)]
+    ends = dict.fromkeys(f"{end(budgets):,}" for end in (min, max) if budgets)
+    steps = f", {' to '.join(ends)} environment steps per run" if budgets else ""
+    # A stage of all stages has a name of its own in its conditions' labels.
+    several = sum(one.stage.has_task_reward for one in report.analyses) > 1
+    of_stage = f"in stage {stage.name} " if several and stage.name != SIDE_BY_SIDE else ""
+    where = f"{of_stage}on {_enumerated(stage.tasks)} ({_seeds({run.seed for run in runs})}{steps})"
+    labels = [condition.short_label for condition in compared]
     if len(labels) == 1:
         return f"What {aim} does {labels[0]} reach {where}?"
     which = _enumerated(labels, "or") if len(labels) <= 4 else f"{len(labels)} conditions"
@@ -245,7 +251,7 @@ def _figure(title: str, drawings: Sequence[Drawing]) -> Mapping[str, Any]:
     return {
         "name": slug(title),
         "title": title,
-        "caption": drawings[-1].caption,
+        "caption": _caption(drawings),
         "metric": None if metric is None else metric.name,
         "drawings": drawings,
         # A CSS class for the number of columns that it spans.
@@ -253,8 +259,20 @@ def _figure(title: str, drawings: Sequence[Drawing]) -> Mapping[str, Any]:
     }
 
 
+def _caption(drawings: Sequence[Drawing]) -> str:
+    """The caption of all drawings, or each one with the stages that have it."""
+    of_stages: dict[str, list[str]] = {}
+    for drawing in drawings:
+        of_stages.setdefault(drawing.caption, []).append(drawing.stage)
+    if len(of_stages) == 1 or len({drawing.stage for drawing in drawings}) == 1:
+        return max(of_stages, key=len)  # of two primary metrics, only success has a target
+    return " ".join(f"{', '.join(stages)}: {text}" for text, stages in of_stages.items())
+
+
 def _remarks(report: SweepReport) -> Iterable[Sequence[str]]:
     """A heading for each stage, and its peculiarities."""
+    claims = report.study.claims if report.both is None else ()  # positions in another sweep
+    compared = {one.runs for claim in claims for pair in claim.pairs for one in pair}
     for analysis in reversed(report.analyses):
         stage = analysis.stage
         remarks = []
@@ -262,18 +280,18 @@ def _remarks(report: SweepReport) -> Iterable[Sequence[str]]:
             remarks.append("Figures and comparisons show the runs on fresh seeds.")
         if not stage.has_task_reward:
             remarks.append("It trains without the task's reward, so its success is chance.")
-        if len(stage.conditions) == 1:
+        if len(stage.conditions) == 1 and stage.conditions[0].runs not in compared:
             remarks.append(f"It has one condition ({stage.conditions[0].label}): no comparison.")
         if len(stage.seeds) == 1:
             remarks.append(f"It has one seed ({stage.seeds[0]}): no intervals and no tests.")
         seeds = " to ".join(dict.fromkeys((stage.seeds[0], stage.seeds[-1])))
-        heading = f"Stage {stage.name} ({stage.variant}), {_seeds(stage)} ({seeds})"
+        heading = f"Stage {stage.name} ({stage.variant}), {_seeds(stage.seeds)} ({seeds})"
         if remarks or len(report.analyses) > 1:
             yield [heading, *remarks]
 
 
-def _seeds(stage: StageRuns) -> str:
-    return "1 seed" if len(stage.seeds) == 1 else f"{len(stage.seeds)} seeds"
+def _seeds(seeds: Collection[str]) -> str:
+    return "1 seed" if len(seeds) == 1 else f"{len(seeds)} seeds"
 
 
 def _enumerated(words: Sequence[str], last: str = "and") -> str:

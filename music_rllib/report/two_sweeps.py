@@ -10,6 +10,7 @@ from music_rllib import names
 from music_rllib.results import statistics as st
 from music_rllib.results.analysis import FinalScores, StageAnalysis
 from music_rllib.results.archive import merged
+from music_rllib.results.conditions import sorting_key
 from music_rllib.results.data import RunRecord, Sweep
 from music_rllib.results.tables import Table
 
@@ -93,11 +94,14 @@ def _values_text(values: set[str] | None) -> str | None:
     if not values:
         return None
     more = len(values) - MOST_VALUES
-    return ", ".join(sorted(values)[:MOST_VALUES]) + (f" and {more} more" if more > 0 else "")
+    text = ", ".join(sorted(values, key=sorting_key)[:MOST_VALUES])
+    return text + (f" and {more} more" if more > 0 else "")
 
 
 def _results_table(analyses: Sequence[StageAnalysis], titles: tuple[str, str]) -> Table:
-    one, other = (_finals(analyses, title) for title in titles)
+    # Without the task's reward, success is chance.
+    rewarded = [one for one in analyses if one.stage.has_task_reward] or analyses
+    one, other = (_finals(rewarded, title) for title in titles)
     rows = []
     for key in dict.fromkeys((*one, *other)):
         found = [finals[key].estimate if key in finals else None for finals in (one, other)]

@@ -109,7 +109,7 @@ def stages_together(stages: Sequence[StageRuns]) -> StageRuns | None:
         name=SIDE_BY_SIDE,
         variant=" and ".join(dict.fromkeys(stage.variant for stage in stages)),
         tasks=tuple(dict.fromkeys(task for stage in stages for task in stage.tasks)),
-        seeds=tuple(sorted({seed for stage in stages for seed in stage.seeds}, key=_number)),
+        seeds=tuple(sorted({seed for stage in stages for seed in stage.seeds}, key=sorting_key)),
         runs=tuple(run for stage in stages for run in stage.runs),
         conditions=tuple(
             replace(condition, others=(("stage", stage.name), *condition.others))
@@ -170,7 +170,7 @@ def _stage(
         name=name,
         variant=records[runs[0]].variant,
         tasks=tuple(dict.fromkeys(records[run].task for run in runs)),
-        seeds=tuple(sorted({records[run].seed for run in runs}, key=_number)),
+        seeds=tuple(sorted({records[run].seed for run in runs}, key=sorting_key)),
         runs=tuple(runs),
         conditions=tuple(
             Condition(entropic_index=q, others=others, runs=tuple(members))
@@ -180,7 +180,7 @@ def _stage(
 
 
 def _order(q: str, others: Values) -> tuple[object, ...]:
-    return _number(q), tuple((name, _number(value)) for name, value in others)
+    return sorting_key(q), tuple((name, sorting_key(value)) for name, value in others)
 
 
 def _varying(runs: Sequence[tuple[str, Mapping[str, str]]]) -> list[str]:
@@ -245,7 +245,7 @@ def _settings(run: RunRecord) -> dict[str, tuple[str, str]]:
     return {name: (words[name], ", ".join(full[name])) for name in words}
 
 
-def _number(text: str) -> tuple[float, str]:
+def sorting_key(text: str) -> tuple[float, str]:
     """Sorting key: numbers by size, a schedule by its first value, other words last."""
     try:
         return float(text.split(" ")[0]), text

@@ -11,7 +11,7 @@ from music_rllib.results import statistics as st
 from music_rllib.results.statistics import Estimate
 from music_rllib.results.tables import DASH, UNFOLDED_ROWS, Entry, Share, Table
 
-_TRIALS = {"judged": "scored", "pruned": "stopped early", "failed": "failed"}
+_TRIALS = {"judged": "scored", "pruned": "stopped early", "failed": "failed", "running": "running"}
 
 
 def search_in_words(search: Entry) -> str:
@@ -21,7 +21,8 @@ def search_in_words(search: Entry) -> str:
         f"{states.count(state)} {word}" for state, word in _TRIALS.items() if state in states
     )
     aims = " and ".join(f"{aim['direction']} {aim['name']}" for aim in search["objectives"])
-    return f"{search['mode'].capitalize()} ({search['sampler']}): {aims}; trials: {counts}."
+    start = f"{search['mode'].capitalize()} ({search['sampler']}): {aims}"
+    return f"{start}; trials: {counts or 'none'}."
 
 
 def search_tables(search: Entry) -> Iterator[Table]:

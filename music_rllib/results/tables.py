@@ -156,7 +156,7 @@ def _number(value: float) -> str:
     if isinstance(value, Share):
         return f"{value:.0%}"
     if isinstance(value, Difference):
-        return f"{value:+.3g}"
+        return f"{value:+,.0f}" if abs(value) >= 100 else f"{value:+.3g}"
     if isinstance(value, Seconds):
         minutes, seconds = divmod(round(value), 60)
         return f"{minutes // 60}:{minutes % 60:02d}:{seconds:02d}"

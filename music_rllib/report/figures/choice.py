@@ -21,6 +21,7 @@ from music_rllib.report.figures.plots import (
     entropy_subplot,
     exploration_subplot,
     finals_subplot,
+    lines_of,
     profile_subplot,
     styles_of,
 )
@@ -34,7 +35,7 @@ from music_rllib.results.analysis import (
     curve,
 )
 from music_rllib.results.claims import Claim
-from music_rllib.results.conditions import ALPHA, Condition, StageRuns, stages_together
+from music_rllib.results.conditions import ALPHA, OF_TASK, Condition, StageRuns, stages_together
 from music_rllib.results.data import Sweep
 from music_rllib.results.statistics import SHOW_SEEDS_BELOW
 from music_rllib.results.study import MOST_CONDITIONS, Study, alpha_lines
@@ -66,7 +67,7 @@ MOST_FACETS = 8
 MOST_LINES = 10
 """Largest number of lines in a subplot of the overview."""
 MOST_IN_LEGEND = 4
-"""Largest number of lines for which each subplot of the overview has a legend of its own."""
+"""Largest number of lines of text in a legend of each subplot of the overview."""
 MOST_DIFFERENCES = 20
 """Largest number of comparisons on a task that have a figure."""
 
@@ -275,7 +276,7 @@ def _against_entropy(sweep: Sweep, stage: StageRuns) -> Iterator[Drawing]:
                 title=title,
                 caption=caption,
                 subplots=subplots,
-                legend=[(f"q = {q}", style) for q, style in by_q.items()],
+                legend=[(f"q = {q}" if q else OF_TASK, style) for q, style in by_q.items()],
                 group=group,
             )
 
@@ -341,12 +342,14 @@ def _differences(study: Study, stage: str) -> Iterator[Drawing]:
         if claim.contrast.difference.has_interval:
             label = f"{claim.first} against {claim.second}"
             rows.setdefault(claim.task, []).append((label, claim))
+    has_margin = any(claim.margin is not None for found in rows.values() for _, claim in found)
+    margin = ", which must lie in the shaded margin for equivalence" if has_margin else ""
     if rows and max(map(len, rows.values())) <= MOST_DIFFERENCES:
         yield Drawing(
             stage=stage,
             title="Differences",
-            caption="First condition minus second. Thin lines are 95% CIs, thick lines 90% CIs, "
-            "which must lie in the shaded margin for equivalence.",
+            caption="First condition minus second. Thin lines are 95% CIs, thick lines 90% CIs"
+            f"{margin}.",
             subplots=tuple(
                 differences_subplot(task, found, f"difference of the {found[0][1].measure.words}")
                 for task, found in rows.items()
@@ -369,7 +372,8 @@ def overview(sweep: Sweep, stages: Sequence[StageRuns]) -> tuple[tuple[Subplot, 
     entries = [entry for *_, legend in parts for entry in legend]
     together = dict(entries)
     # Within a subplot, a legend of many lines would hide them.
-    below = max((len(legend) for *_, legend in parts), default=0) > MOST_IN_LEGEND and all(
+    lines = (sum(map(lines_of, dict(legend))) for *_, legend in parts)
+    below = max(lines, default=0) > MOST_IN_LEGEND and all(
         together[label] == style for label, style in entries
     )
     subplots = tuple(

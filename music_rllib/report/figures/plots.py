@@ -34,21 +34,12 @@ from music_rllib.results.study import AlphaLine, Mean
 LIGHT, DARK = "#ffffff", "#14171c"
 """Background of the page in light and in dark mode."""
 _ANCHORS = (
-    (0.5, "#b07aa1"),
-    (1.0, "#1f7fc4"),
-    (1.5, "#d55e00"),
-    (2.0, "#009e73"),
-    (3.0, "#a0522d"),
-)
+    (0.5, "#b07aa1"), (1.0, "#1f7fc4"), (1.5, "#d55e00"), (2.0, "#009e73"), (3.0, "#a0522d")
+)  # fmt: skip
 _UNKNOWN = "#808080"
 _OF_EQUAL_Q = (
-    *(color for _, color in _ANCHORS),
-    "#b58900",
-    "#e0529c",
-    "#7a8a00",
-    _UNKNOWN,
-    "#a066e0",
-)
+    *(color for _, color in _ANCHORS), "#b58900", "#e0529c", "#7a8a00", _UNKNOWN, "#a066e0"
+)  # fmt: skip
 """Colors of conditions that differ in other settings than q, after the color of their q."""
 _MARKERS = "osD^vPX"
 _DASHES: tuple[tuple[float, ...], ...] = (
@@ -204,6 +195,11 @@ def curve_subplot(
             axes.legend(handles=handles, **look).set_in_layout(False)
 
     return Subplot(title=title, draw=draw)
+
+
+def lines_of(label: str) -> int:
+    """Number of lines of a label inside a subplot."""
+    return len(textwrap.wrap(label, _LABEL))
 
 
 def _draw_curve(axes: Axes, curve: Curve, style: Style, stagger: float) -> None:
@@ -397,12 +393,14 @@ def alpha_subplot(task: str, lines: Sequence[tuple[AlphaLine, Style]]) -> Subplo
             axes.plot(own, value, color=style.color, linestyle=style.line, marker=style.marker)
             axes.fill_between(own, lower, upper, color=style.color, alpha=0.2, linewidth=0)
         alphas = np.unique([alpha for line, _ in lines for alpha, _ in line])
-        if alphas[0] > 0 and alphas[-1] / alphas[0] > 5:
-            axes.set_xscale("log")
+        positive = alphas[alphas > 0]
+        if alphas[0] >= 0 and len(positive) and positive[-1] / positive[0] > 5:
+            of_zero = {} if alphas[0] > 0 else {"linthresh": positive[0]}
+            axes.set_xscale("symlog" if of_zero else "log", **of_zero)
         if len(alphas) <= MOST_TICKS:
             axes.set_xticks(alphas, [f"{alpha:g}" for alpha in alphas], minor=False)
             axes.set_xticks([], minor=True)
-        elif axes.get_xscale() == "log":
+        elif axes.get_xscale() != "linear":
             # The scale's own labels are formulas, but text.parse_math is off.
             axes.xaxis.set_major_formatter(LogFormatter())
             axes.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1, 0.4)))

@@ -108,7 +108,9 @@ def measured(metric: str, value: float | None) -> str:
     """`35 %` for a rate, `0.12 m` for a displacement, `-5.2` for a return, `-` for None."""
     if value is None or metric in names.EVAL_RATES:
         return percent(value)
-    return f"{value:.2f} m" if metric == names.EVAL_DISPLACEMENT else f"{value:.4g}"
+    if metric == names.EVAL_DISPLACEMENT:
+        return f"{value:.2f} m"
+    return f"{value:,.0f}" if abs(value) >= 10_000 else f"{value:.4g}"
 
 
 def evaluation_text(run: RunSettings, metrics: Mapping[str, float], *, any_step: bool) -> str:
