@@ -249,8 +249,8 @@ class InitFrom(StrictModel):
     that stage has a grid, each of its trials is combined with each point of this one's."""
     checkpoint: str | None = None
     """Instead of a stage: local folder of a handoff from outside the sweep, exported by `best` or
-    of a finished run (`STORAGE/nodes/KEY`). It is copied into the storage: later commands do not
-    need the folder."""
+    of a finished run (`STORAGE/nodes/KEY`). It is copied into the storage: `resume` and commands on
+    the sweep's folder do not need it later."""
     task: str | None = None
     """Task of the run or the checkpoint to start from; null: each run's own task."""
 

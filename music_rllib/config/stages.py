@@ -29,7 +29,13 @@ from music_rllib.config.schema import ImportedHandoff, Point, Source, Stage, Sta
 from music_rllib.config.search import of_stage
 from music_rllib.envs.tasks import BUILT_IN_TASKS, Task, closest
 from music_rllib.limits import MOST_GRID_POINTS
-from music_rllib.store.handoff import Architecture, HandoffError, open_handoff, read_handoff
+from music_rllib.store.handoff import (
+    Architecture,
+    HandoffError,
+    open_handoff,
+    read_handoff,
+    task_differences,
+)
 
 FindTasks = Callable[[Iterable[str], Findings], tuple[Task, ...]]
 
@@ -259,12 +265,13 @@ def _check_checkpoint(
 ) -> None:
     made_for = checkpoint.manifest.info.task
     for wanted in [task] if task else stage.tasks:
-        if wanted.identity() != made_for.identity():
-            findings.add(
-                (),
-                f"must be of task {wanted.name}, got one of {made_for.name}; "
-                f"to start from it, add 'task: {made_for.name}'",
-            )
+        if differences := task_differences(made_for, wanted):
+            rule = f"must be of task {wanted.name}, got one of {made_for.name}; "
+            if wanted.name == made_for.name:  # of another sweep, which declares it differently
+                rule += "; ".join(differences)
+            else:
+                rule += f"to start from it, add 'task: {made_for.name}'"
+            findings.add((), rule)
     problems_before = len(findings.problems)
     for _, point in stage.examples():
         theirs = checkpoint.manifest.info.architecture

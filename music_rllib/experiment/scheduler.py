@@ -106,6 +106,11 @@ class Scheduler:
             turn = zlib.crc32(self._salt + node.key.encode())
         return seed, late, turn
 
+    def is_awaited(self, key: str) -> bool:
+        """Whether a node waits for this one."""
+        waiting = self.having(Status.WAITING)
+        return any(node.input is not None and node.input.key == key for node in waiting)
+
     def waits_for_input(self, key: str) -> bool:
         """Whether the node waits for a node that is not done."""
         return self._status[key] is Status.WAITING and not self._input_is_there(self._nodes[key])

@@ -26,6 +26,7 @@ from music_rllib.redaction import redact
 from music_rllib.store.lease import runs_here, this_machine
 from music_rllib.store.node_store import NodeStore
 from music_rllib.store.storage import (
+    DamagedError,
     StorageError,
     StorageFolder,
     below,
@@ -99,7 +100,12 @@ class SweepLocation:
         for stage in document["stages"]:
             match stage.get("init_from"):
                 case {"checkpoint": str(place)} as source if place.startswith(IN_STORAGE):
-                    source["checkpoint"] = str(store.lasting_files(place.removeprefix(IN_STORAGE)))
+                    key = place.removeprefix(IN_STORAGE)
+                    try:
+                        source["checkpoint"] = str(store.lasting_files(key))
+                    except DamagedError as error:
+                        again = "run the sweep's YAML file with --retrain-damaged"
+                        raise DamagedError(f"{error}; to import it again, {again}") from error
         return document
 
     def config(self, seeds: str | None = None) -> SweepConfig:

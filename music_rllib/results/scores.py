@@ -227,7 +227,8 @@ def with_pretraining(sweep: Sweep) -> Sweep:
     """The sweep with steps that count from the first step of each run's pretraining.
 
     A run that starts from another run of the sweep has the curves of that run before its own, and
-    its budget is the sum of both.
+    its budget is the sum of both. Of a run on another task only the steps count: its values are not
+    those of the task.
     """
     position = {run.node_key: i for i, run in enumerate(sweep.runs) if run.node_key}
     budgets = [run.budget or sweep.last_step(i) for i, run in enumerate(sweep.runs)]
@@ -241,7 +242,8 @@ def with_pretraining(sweep: Sweep) -> Sweep:
         for part in chain:
             own = column.of_run(part)
             if part != chain[-1]:  # the last evaluation of a run can be after its budget
-                own = own.select(own.step <= budgets[part])
+                same_task = sweep.runs[part].task == sweep.runs[chain[-1]].task
+                own = own.select((own.step <= budgets[part]) & same_task)
             parts.append(own._replace(run=0 * own.run + chain[-1], step=own.step + before))
             before += budgets[part]
         curve = joined(parts)

@@ -344,12 +344,14 @@ class SearchController(Listener):
             text = f"{'stopped early' if state is TrialState.PRUNED else 'FAILED'}, {reason}"
         self._say(f"{search.label(one.study)} trial {one.trial.number}: {text}")
         needed = {run.key for each in self.searches for other in each.running for run in other.runs}
-        for run in one.runs:
-            if run.key in needed or self._scheduler.is_planned(run.key):
+        # Each run before the runs that it starts from, which other runs may need.
+        for node in (node for run in one.runs for node in reversed(self._plan.chain(run.key))):
+            planned = self._scheduler.is_planned(node.key)
+            if node.key in needed or planned or self._scheduler.is_awaited(node.key):
                 continue
-            self._reports.pop(run.key, None)
-            if self._scheduler.prune(run.key):
-                self._pruned(self._plan.node(run.key), reason)
+            self._reports.pop(node.key, None)
+            if self._scheduler.prune(node.key):
+                self._pruned(node, reason)
 
     # -- the final ranking -------------------------------------------------------------------
 

@@ -8,6 +8,7 @@ the manifest was forged too, it is not a safetensors file.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
@@ -196,7 +197,7 @@ def open_handoff(folder: Path) -> tuple[Path, HandoffManifest]:
     Raises:
         HandoffError: The handoff does not exist, or its manifest is not valid.
     """
-    for candidate in (folder, folder / "handoff"):
+    for candidate in (folder, folder / "handoff", *_in_uploaded_node(folder)):
         path = candidate / MANIFEST
         if path.is_file():
             try:
@@ -208,6 +209,17 @@ def open_handoff(folder: Path) -> tuple[Path, HandoffManifest]:
                 ) from None
     found = "the folder exists" if folder.is_dir() else "the folder does not exist"
     raise HandoffError(f"{folder} must hold a handoff ({MANIFEST} and weights): {found}")
+
+
+def _in_uploaded_node(folder: Path) -> list[Path]:
+    """The handoff in a copy of a node of a bucket, whose files are below a prefix."""
+    from music_rllib.store.sealed import MANIFEST as SEALED
+    from music_rllib.store.sealed import Manifest
+
+    with contextlib.suppress(OSError, ValueError):
+        sealed = Manifest.model_validate(read_json(read_regular(folder / SEALED, MOST_JSON_BYTES)))
+        return [folder / sealed.prefix / "handoff"]
+    return []
 
 
 def read_handoff(
@@ -231,14 +243,18 @@ def read_handoff(
     return {name: _read_weights(folder, manifest.modules[name]) for name in networks}
 
 
-def _check_task(folder: Path, source: Task, task: Task) -> None:
-    theirs, ours = source.identity(), task.identity()
-    differences = [
+def task_differences(source: Task, task: Task) -> list[str]:
+    """The differences of a handoff's task from the one that is wanted, in words."""
+    theirs, ours = (one.identity() | {"seed_range": one.seed_range} for one in (source, task))
+    return [
         f"{key} is {json.dumps(theirs[key])} there and {json.dumps(ours[key])} here"
         for key in ours
         if theirs[key] != ours[key]
     ]
-    if differences:
+
+
+def _check_task(folder: Path, source: Task, task: Task) -> None:
+    if differences := task_differences(source, task):
         raise HandoffError(
             f"{folder} must be of task {task.name}, it is of {source.name}: "
             + "; ".join(differences)

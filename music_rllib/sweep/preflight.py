@@ -30,7 +30,7 @@ from music_rllib.experiment.plan import Plan
 from music_rllib.runtime.machine import check_reachable, cluster_address
 from music_rllib.runtime.machine import memory as memory_of_machine
 from music_rllib.runtime.process import early
-from music_rllib.store.handoff import open_handoff, read_handoff
+from music_rllib.store.handoff import HandoffError, open_handoff, read_handoff
 from music_rllib.store.node_store import NodeStore
 from music_rllib.sweep.views.plan import cluster_answer, cluster_text
 
@@ -173,13 +173,17 @@ def import_checkpoints(plan: Plan, store: NodeStore) -> None:
     """Copy handoffs from outside into the store, where workers on any machine find them.
 
     Raises:
-        HandoffError: One is damaged.
+        HandoffError: One is damaged, or is another one than when the sweep was loaded.
         StorageError: The store can't be written.
     """
     for handoff in plan.imports:
         if store.is_finished(handoff.key):
             continue
         folder, manifest = open_handoff(handoff.folder)
+        if manifest.content_hash != handoff.manifest.content_hash:
+            raise HandoffError(
+                f"{handoff.folder} must not change while the sweep starts, it has: start it again"
+            )
         read_handoff(folder, list(manifest.modules), manifest.info.task)
         with TemporaryDirectory() as temporary:
             target = Path(temporary, "handoff")

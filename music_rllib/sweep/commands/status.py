@@ -79,6 +79,7 @@ def _labels(location: SweepLocation) -> list[str]:
 
 def state_of(location: SweepLocation) -> dict[str, Any]:
     """The sweep's `state.json`, with its present state and its damaged runs."""
+    from music_rllib.config.schema import IMPORTED
     from music_rllib.experiment import sweep_files
     from music_rllib.experiment.record import earlier_text
     from music_rllib.store.node_store import NodeStore
@@ -91,8 +92,11 @@ def state_of(location: SweepLocation) -> dict[str, Any]:
         outcome = "interrupted" if outcome == "running" else outcome
         _mark_interrupted(state)
     store, nodes = NodeStore(location.storage), location.nodes()
-    finished = store.finished(node["key"] for node in nodes)
-    labels = {node["key"]: node["label"] for node in nodes if node["key"] in finished}
+    labels = {node["key"]: node["label"] for node in nodes}
+    sources = {str(node["input"]) for node in nodes} - labels.keys()
+    labels |= {key: key for key in sources if key.startswith(IMPORTED)}
+    finished = store.finished(labels)
+    labels = {key: label for key, label in labels.items() if key in finished}
     damaged = [
         {"run": labels[key], "cause": str(error)} for key, error in store.damage(labels).items()
     ]

@@ -966,3 +966,14 @@ def test_steps_to_come_are_without_sources_that_the_search_has_asked_for(tmp_pat
     recorded(tmp_path, content)
     state = json.loads((tmp_path / "results/s/state.json").read_text())
     assert state["env_steps"] == {"done": 112_000, "left": 4_000, "to_come": 0}
+
+
+def test_a_failed_trial_pretrains_nothing_more(tmp_path: Path) -> None:
+    space = {"pretrain:tac.alpha": {"choice": [0.1, 0.2]}}
+    search = {"space": space, "sampler": "grid", "trials": None, "concurrent": 1}
+    driver = Driver(tmp_path, document(search), lambda run, share: share)
+    first = {"pretrain/FetchPush/tac.alpha=0.1/seed0"}
+    driver.play(slots=1, fails=lambda node: node.label in first)
+    assert [trial["state"] for trial in driver.trials()] == ["failed", "judged"]
+    computed = [driver.sweep.plan.node(one.partition("/")[0]) for one in driver.computed]
+    assert {node.run.tac.alpha for node in computed if node.stage == "pretrain"} == {0.2}

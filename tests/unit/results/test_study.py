@@ -1298,3 +1298,19 @@ def test_a_hypothesis_that_later_names_its_stage_is_the_same() -> None:
     ]
     once = with_plan((), plan(full, short, stage="her"), DONE - 1)
     assert study_of(sweep_of(her, once)).family == 1
+
+
+def test_success_on_another_task_does_not_count_in_auc_total(tmp_path: Path) -> None:
+    source = {"stage": "push", "task": "FetchPush"}
+    stages = [
+        {"name": "push", "variant": "tac", "tasks": ["FetchPush"]},
+        {"name": "transfer", "variant": "music-f", "init_from": source},
+    ]
+    content = {"name": "s", "tasks": ["FetchPickAndPlace"], "stages": stages}
+    plan = make_plan(loaded(tmp_path, content | {"defaults": {"env_steps": 4000}}))
+    steps, metric = [0, 2000, 4000], [names.EVAL_SUCCESS] * 3
+    points = [Points(metric, steps, steps, [value] * 3) for value in (0.9, 0.1)]
+    sweep = with_pretraining(replace(LastValues(plan).sweep({}), history=columns(points)))
+    found, values = sweep.series(1, names.EVAL_SUCCESS)
+    assert (found.tolist(), values.tolist()) == ([4000, 6000, 8000], [0.1] * 3)
+    assert sweep.runs[1].budget == 8000

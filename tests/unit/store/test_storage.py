@@ -93,7 +93,7 @@ def test_a_folder_of_another_user_is_refused(
 
 
 def test_unknown_homes_and_invalid_text_are_refused() -> None:
-    with pytest.raises(StorageError, match="home that is known, got '~nobody-at-all/x'"):
+    with pytest.raises(StorageError, match="existing home folder, got '~nobody-at-all/x'"):
         resolve_storage("~nobody-at-all/x")
     with pytest.raises(ConfigError, match=r"^--storage must be UTF-8 text, got '\\udcff'$"):
         load_config(DEFAULT_CONFIG, storage=os.fsdecode(b"\xff"))
