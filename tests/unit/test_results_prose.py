@@ -292,28 +292,35 @@ def test_fetchslide_in_both_forms() -> None:
 
 
 def test_the_papers_own_setting() -> None:
-    study, every = "claims-paper-setting", 320
-    (after,) = runs(study, "music-r").run
-    (before,) = runs(study, "pretrain").run
-    late = curve(study, after, MEAN)[1][-5:]
-    start = curve(study, before, MEAN)[1][0]
-    assert set(exported(study)["param.evaluation.episodes"].astype(int)) == {every}
-    assert (
-        f"succeeds in {round(late.sum() * every)} of {5 * every:,} episodes ({late.mean():.1%}), "
-        f"before any training in {round(start * every)} of {every} ({start:.1%})"
-    ) in TEXT
-    moved = pd.read_parquet(DATA / study / "metrics.parquet").query(
-        "run == @after and metric == 'evaluation/object_moved_share'"
-    )
-    assert round(10 * moved.sort_values("env_steps").value[-12:].mean()) == 9
-    assert f"complete, {len(exported(study))} of 2 runs" in TEXT
-    own = exported(study).iloc[0]
+    first, pilot, every = "claims-paper-setting", "paper-setting-alpha", 320
+    late, starts = {}, []
+    for study in (first, pilot):
+        assert set(exported(study)["param.evaluation.episodes"].astype(int)) == {every}
+        values = pd.read_parquet(DATA / study / "metrics.parquet").sort_values("env_steps")
+        moved = values[values.metric == "evaluation/object_moved_share"].groupby("run").value
+        for run, alpha in runs(study, "music-r").set_index("run").alpha.items():
+            late[alpha] = curve(study, run, MEAN)[1][-5:]
+            assert round(10 * moved.get_group(run).iloc[-12:].mean()) >= 9
+        (before,) = runs(study, "pretrain").run
+        starts.append(curve(study, before, MEAN)[1][0])
+    order = ("0.2", "0.02", "0.05", "0.5")
+    counts = [round(late[alpha].sum() * every) for alpha in order]
+    shares = "{:.1%}, {:.1%}, {:.1%} and {:.1%}".format(*(late[alpha].mean() for alpha in order))
+    each = "{} (α = 0.2), {} (0.02), {} (0.05) and {} (0.5)".format(*counts)
+    assert f"succeed in {each} of {5 * every:,} episodes ({shares}), " in TEXT
+    ends = " and ".join(str(round(start * every)) for start in starts)
+    share = " and ".join(f"{start:.1%}" for start in starts)
+    assert f"before any training in {ends} of {every} ({share})" in TEXT
+    assert f"complete, {len(exported(first))} of 2 runs" in TEXT
+    assert f"complete, {len(exported(pilot))} of 4 runs" in TEXT
+    own = exported(first).iloc[0]
     of = own["param.music.batch_trajectories"]
-    assert f"trained on {of} trajectories in place of 4,096, and one α ({own['tag.alpha']})" in TEXT
-    epochs = [runs(study, stage).budget.item() // 80_000 for stage in ("pretrain", "music-r")]
+    assert f"trained on {of} trajectories in place of 4,096, and α = {own['tag.alpha']} (" in TEXT
+    epochs = [runs(first, stage).budget.item() // 80_000 for stage in ("pretrain", "music-r")]
     assert (
         f"{sum(epochs)} of the paper's 100 epochs ({epochs[0]} of MUSIC-u and {epochs[1]}" in TEXT
     )
+    assert {int(one) for one in runs(pilot, "music-r").budget} == {80_000 * epochs[1]}
 
 
 def test_the_bonus_for_moving_the_object() -> None:
