@@ -54,6 +54,7 @@ from music_rllib.store import storage as storage_module
 from music_rllib.store.history import HISTORY, Report, RunResult, to_json_lines
 from music_rllib.store.lease import Lease, LeaseFile
 from music_rllib.store.storage import DamagedError, StorageError, StorageFolder
+from music_rllib.store.work_folder import WorkFolder
 from music_rllib.sweep import clean, driver, driver_lock, execution
 from music_rllib.sweep.commands.run import resume
 from music_rllib.sweep.export import sweep_of_run
@@ -571,6 +572,15 @@ def test_a_plan_of_ten_thousand_runs_asks_a_bucket_for_less_than_a_minute(
     assert few + (many - few) * (10_000 - 135) / 45 < 60
 
 
+def last_checkpoint(sweep: OpenSweep, env_steps: int) -> WorkFolder:
+    """The folder of the first run's last checkpoint, with a checkpoint after `env_steps`."""
+    node = sweep.plan.nodes[0]
+    last = sweep.store.continuation(continuation_key(node.run, node.source_key))
+    with last.new_checkpoint(env_steps) as new:
+        (new.folder / "x").touch()
+    return last
+
+
 @IN_A_BUCKET
 def test_clean_keeps_a_last_checkpoint_that_another_sweep_shares(
     storage: str, tmp_path: Path, program: Program
@@ -578,14 +588,11 @@ def test_clean_keeps_a_last_checkpoint_that_another_sweep_shares(
     """Runs that differ only in their budget share one folder for it."""
     longer = opened(storage, tmp_path, name="long", defaults={"env_steps": 8000})
     sweep = played(storage, tmp_path)
-    node = sweep.plan.nodes[0]
-    last = sweep.store.continuation(continuation_key(node.run, node.source_key))
-    with last.new_checkpoint(8000) as new:
-        (new.folder / "x").touch()
+    last = last_checkpoint(sweep, 8000)
     going = program("clean", f"{storage}/mine", "--yes", "--json").document
     assert not going["items"]
     (kept,) = going["kept"]
-    assert kept["what"] == f"last checkpoint of {node.label}: long has it too"
+    assert kept["what"] == f"last checkpoint of {sweep.plan.nodes[0].label}: long has it too"
     assert len(last.names()) == 1
     longer.location.files.remove("plan.json")
     opened(storage, tmp_path, defaults={"env_steps": 8000})  # now two runs of `mine` share it
@@ -599,13 +606,26 @@ def test_clean_all_leaves_no_last_checkpoint_of_a_shorter_run(
     storage: str, tmp_path: Path, program: Program
 ) -> None:
     """Nothing would list it when the sweep's own files are gone."""
-    sweep = played(storage, tmp_path)
-    node = sweep.plan.nodes[0]
-    last = sweep.store.continuation(continuation_key(node.run, node.source_key))
-    with last.new_checkpoint(4000) as new:
-        (new.folder / "x").touch()
+    last = last_checkpoint(played(storage, tmp_path), 4000)
     opened(storage, tmp_path, defaults={"env_steps": 8000})
     assert program("clean", f"{storage}/mine", "--all", "--yes").code == 0
+    assert not last.names()
+
+
+def test_clean_keeps_the_last_checkpoint_from_which_a_run_of_the_plan_starts(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    last = last_checkpoint(played(storage, tmp_path), 4000)
+    longer = opened(storage, tmp_path, defaults={"env_steps": 8000})  # and interrupted at once
+    assert longer.continued_from(longer.plan.nodes[0]) == 4000
+    assert program("clean", f"{storage}/mine", "--yes").code == 0
+    assert last.names()
+    own = longer.store.work_folder(longer.plan.nodes[0].key)
+    with own.new_checkpoint(6000) as new:
+        (new.folder / "x").touch()
+    again = opened(storage, tmp_path, defaults={"env_steps": 8000})
+    assert again.continued_from(again.plan.nodes[0]) is None, "it resumes from its own"
+    assert program("clean", f"{storage}/mine", "--unfinished", "--yes").code == 0
     assert not last.names()
 
 
@@ -1193,24 +1213,3 @@ def test_an_empty_storage_is_refused(
 def test_the_last_line_of_a_watch_ends(storage: str, tmp_path: Path, program: Program) -> None:
     played(storage, tmp_path)
     assert program("status", f"{storage}/mine", "--watch").output.endswith("\n")
-
-
-def test_clean_keeps_the_last_checkpoint_from_which_a_run_of_the_plan_starts(
-    storage: str, tmp_path: Path, program: Program
-) -> None:
-    sweep = played(storage, tmp_path)
-    node = sweep.plan.nodes[0]
-    last = sweep.store.continuation(continuation_key(node.run, node.source_key))
-    with last.new_checkpoint(4000) as new:
-        (new.folder / "x").touch()
-    longer = opened(storage, tmp_path, defaults={"env_steps": 8000})  # and interrupted at once
-    assert longer.continued_from(longer.plan.nodes[0]) == 4000
-    assert program("clean", f"{storage}/mine", "--yes").code == 0
-    assert last.names()
-    own = longer.store.work_folder(longer.plan.nodes[0].key)
-    with own.new_checkpoint(6000) as new:
-        (new.folder / "x").touch()
-    again = opened(storage, tmp_path, defaults={"env_steps": 8000})
-    assert again.continued_from(again.plan.nodes[0]) is None, "it resumes from its own"
-    assert program("clean", f"{storage}/mine", "--unfinished", "--yes").code == 0
-    assert not last.names()
