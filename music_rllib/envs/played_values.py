@@ -17,6 +17,8 @@ from music_rllib.envs.values import GOAL_KEYS
 
 _LOST = 0.05
 """Share of the range of some numbers from which on their rounding to float32 is reported."""
+_STILL = 1e-5
+"""Range up to which a number of an observation is constant, as the height of an object at rest."""
 FEWEST_EPISODES = 3
 """Number of episodes with different goals that show what an observation contains."""
 
@@ -35,10 +37,10 @@ class Rounding:
         self._low, self._high = np.minimum(self._low, exact), np.maximum(self._high, exact)
         self._error = np.maximum(self._error, np.abs(exact - exact.astype(np.float32)))
 
-    def lost(self) -> NDArray[np.intp]:
-        """Positions of the numbers of whose range float32 loses more than `_LOST`."""
+    def lost(self, still: float = 0.0) -> NDArray[np.intp]:
+        """Positions of the numbers of whose range, above `still`, float32 loses over `_LOST`."""
         varied = np.asarray(self._high - self._low)
-        return np.flatnonzero((varied > 0) & (self._error > _LOST * varied))
+        return np.flatnonzero((varied > still) & (self._error > _LOST * varied))
 
 
 class PlayedValues:
@@ -101,7 +103,7 @@ class PlayedValues:
         lines += [
             f"observation[{entry}] changes too little for its size: float32, which the networks "
             "get, does not keep its changes; give it relative to an origin that is near"
-            for entry in self._observation.lost()[:1]
+            for entry in self._observation.lost(_STILL)[:1]
         ]
         if len(self._reward.lost()):
             lines.append(

@@ -79,6 +79,8 @@ class Probe:
         """Reasons to refuse the task."""
         self.remarks: list[str] = []
         """Other findings that a user should know."""
+        self.sizes: list[int] = []
+        """Numbers in an observation, a goal and an action; empty for unsupported spaces."""
         self._steps = 0
         self._keys: Counter[str] = Counter()
         self._unused: set[str] = set()
@@ -119,6 +121,7 @@ class Probe:
     def _check(self, env: Env) -> None:
         task = self._task
         action, size, goal = self._spaces(env)
+        self.sizes = [size, goal, int(action.shape[0])]
         self._layout = ReplayLayout(size, int(action.shape[0]), goal, task.horizon)
         self._values = PlayedValues(env.observation_space, size, goal)
         self.problems += beyond_observation(task.agent_indices, task.surrounding_indices, size)

@@ -14,7 +14,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from music_rllib.config.run_settings import RunSettings
+from music_rllib.config.run_settings import VARIANTS, RunSettings
 from music_rllib.config.schema import ImportedHandoff, Source, Stage, SweepConfig
 from music_rllib.config.search import of_stage
 from music_rllib.config.tac_settings import LearnedAlpha
@@ -133,6 +133,17 @@ class Plan:
         sources = [stage.source for stage in self._stages.values() if stage.source]
         found = [source.checkpoint for source in sources if source.checkpoint]
         return tuple({handoff.key: handoff for handoff in found}.values())
+
+    @property
+    def transfers(self) -> list[tuple[Task, Task]]:
+        """The task of the source and of the run, if a stage takes over the agent of another task."""
+        return [
+            (stage.source.task, task)
+            for stage in self._stages.values()
+            if stage.source and stage.source.task and VARIANTS[stage.variant].starts_from == "agent"
+            for task in stage.tasks
+            if task.name != stage.source.task.name
+        ]
 
     @property
     def settings(self) -> list[RunSettings]:

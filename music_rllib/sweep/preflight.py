@@ -46,18 +46,19 @@ _HUMAN = "env_kwargs: {render_mode: human} needs a display; leave it out for tra
 def check_environments(plan: Plan, hang_minutes: float | None = None) -> list[str]:
     """Play each declared environment in a child process, and check that its task describes it.
 
-    One call of an environment may take `hang_minutes`; None: no limit. Returns remarks, one line
+    Also play the tasks between which agents are transferred, whose sizes must be equal. One call of an environment may take `hang_minutes`; None: no limit. Returns remarks, one line
     each.
 
     Raises:
         BadInputError: A task does not fit; with one line per problem, and the remarks.
     """
     runs = [run for run in plan.settings if run.task.name not in BUILT_IN_TASKS]
-    if not runs:
+    transferred = {task.name: task for pair in plan.transfers for task in pair}
+    if not runs and not transferred:
         return []
     from music_rllib.envs.probe import Question
 
-    left: dict[str, Question] = {}
+    left = {name: Question(task=task) for name, task in transferred.items()}
     for run in runs:
         question = left.setdefault(run.task.name, Question(task=run.task))
         if run.replay.hindsight_k > 0:
@@ -66,14 +67,21 @@ def check_environments(plan: Plan, hang_minutes: float | None = None) -> list[st
         if run.intrinsic.reward is not None:
             question.rewards = tuple(sorted({*question.rewards, run.intrinsic.reward}))
         question.intrinsic |= run.music.estimator != "none" or run.intrinsic.reward is not None
-    problems, remarks = [], []
+    problems, remarks, sizes = [], [], {}
     while left:  # the child process ends early at an environment that ends it
-        for name, wrong, noteworthy in _play([*left.values()], hang_minutes):
+        for name, wrong, noteworthy, sizes[name] in _play([*left.values()], hang_minutes):
             human = left.pop(name).task.env_kwargs.get("render_mode") == "human"
             if wrong and human:
                 wrong[0] += f" ({_HUMAN})"
             problems += [f"environments.{name}: {line}" for line in wrong]
             remarks += [f"environments.{name}: {line}" for line in noteworthy]
+    for source, task in plan.transfers:
+        theirs, ours = sizes[source.name], sizes[task.name]
+        if theirs and ours and theirs != ours:
+            problems.append(
+                f"init_from.task must have observations, goals and actions of the sizes of "
+                f"{task.name}, {tuple(ours)}, got {source.name} with {tuple(theirs)}"
+            )
     if problems:
         raise BadInputError("\n".join((*problems, *(f"also: {line}" for line in remarks))))
     return remarks
@@ -109,8 +117,8 @@ def fingerprints(plan: Plan) -> dict[str, Fingerprint]:
 
 def _play(
     questions: list[Question], hang_minutes: float | None
-) -> list[tuple[str, list[str], list[str]]]:
-    """Name, problems and remarks of the tasks that a child process played until it ended."""
+) -> list[tuple[str, list[str], list[str], list[int]]]:
+    """Name, problems, remarks and sizes of the tasks that a child process played until it ended."""
     from music_rllib.envs.probe_process import ANSWERS, REQUEST, Request
 
     seconds = None if hang_minutes is None else 60 * hang_minutes
@@ -145,7 +153,7 @@ def _play(
         name = questions[len(done)].task.name
         calls = [line[2] for line in lines if line[:2] == ["call", name]]
         done.append(
-            (name, [_why_it_ended(process.returncode, (calls or ["import"])[-1], text)], [])
+            (name, [_why_it_ended(process.returncode, (calls or ["import"])[-1], text)], [], [])
         )
     return done
 

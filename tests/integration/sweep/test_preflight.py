@@ -86,6 +86,33 @@ def test_all_problems_are_reported_at_once(tmp_path: Path) -> None:
     assert lines[3].startswith("also: environments.T0: success_key 'is_success' was not in info")
 
 
+def test_an_agent_needs_a_source_of_the_same_sizes(tmp_path: Path) -> None:
+    def played(source: str) -> list[str]:
+        document = {
+            "name": "s",
+            "tasks": [source, "FetchPush"],
+            "defaults": {"env_steps": 2000},
+            "stages": [
+                {"name": "first", "variant": "tac"},
+                {
+                    "name": "next",
+                    "variant": "music-f",
+                    "tasks": ["FetchPush"],
+                    "init_from": {"stage": "first", "task": source},
+                },
+            ],
+        }
+        return check_environments(make_plan(loaded(tmp_path, document)))
+
+    with pytest.raises(BadInputError) as caught:
+        played("FetchReach")
+    assert str(caught.value) == (
+        "init_from.task must have observations, goals and actions of the sizes of FetchPush, "
+        "(25, 3, 4), got FetchReach with (10, 3, 4)"
+    )
+    assert not played("FetchSlide")
+
+
 FATAL = """
 import os, sys, threading, time
 import gymnasium as gym
