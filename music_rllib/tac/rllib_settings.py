@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
@@ -88,14 +89,20 @@ def ignored_settings(config: AlgorithmConfig) -> Iterator[str]:
         yield "api_stack: TAC runs on RLlib's new API stack only"
     if config.is_multi_agent:
         yield "multi_agent(policies=...): TAC trains one policy in a single-agent environment"
+    yield from _without_effect(partial(getattr, config))
+    if isinstance(overrides := config.evaluation_config, dict):
+        yield from (f"evaluation_config: {line}" for line in _without_effect(overrides.get))
+    yield from _unusable_callbacks(config)
+    yield from _unusable_classes(config)
+
+
+def _without_effect(value_of: Callable[[str, Any], Any]) -> Iterator[str]:
     plain = AlgorithmConfig()
     for remedy, settings in _REMEDIES.items():
         for name in settings:
-            value = getattr(config, name, None)
-            if value != getattr(plain, name, None):
+            default = getattr(plain, name, None)
+            if (value := value_of(name, default)) != default:
                 yield f"{name.removeprefix('_')}={_short(value)} has no effect on TAC: {remedy}"
-    yield from _unusable_callbacks(config)
-    yield from _unusable_classes(config)
 
 
 def _short(value: Any) -> str:

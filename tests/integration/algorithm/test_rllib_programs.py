@@ -127,6 +127,10 @@ def with_module(name: str | None, **spec: Any) -> Callable[[TACConfig], TACConfi
             lambda made: made.multi_agent(count_steps_by="agent_steps"),
             "count_steps_by='agent_steps' has no effect",
         ),
+        (
+            lambda made: made.evaluation(evaluation_config={"clip_actions": True, "gamma": 0.5}),
+            "evaluation_config: clip_actions=True has no effect",
+        ),
     ],
 )
 def test_what_has_no_effect_is_refused(
