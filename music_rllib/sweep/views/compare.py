@@ -27,7 +27,8 @@ def compare_stage(
     """The comparison of a stage's conditions as plain data, and as text with tables.
 
     Args:
-        stage: Name of the stage; None: that of the analysis, or the last that trains for the task.
+        stage: Name of the stage; None: that of the recorded analysis plan, or the last that trains
+            for the task.
         metric: The compared metric; None: the objective's, or the primary one of each task.
         minimize: Lower values of the metric are better.
 
@@ -35,12 +36,14 @@ def compare_stage(
         BadInputError: There is no such stage or metric.
     """
     config = location.config()
-    settings = config.stage(stage)
+    stages = {one.name: one for one in config.stages}
     metrics = {task.primary_metric for each in config.stages for task in each.tasks}
     metrics |= {names.EVAL_EPISODES, *names.ENTROPIES, *filter(None, [metric])}
-    if settings.search is not None:
-        metrics.add(settings.search.objectives[0].metric)
+    metrics |= {one.search.objectives[0].metric for one in stages.values() if one.search}
     read = read_stored(location, metrics=metrics)
+    recorded = read.sweep.plans[-1].plan.stage if read.sweep.plans else ""
+    settings = stages.get(recorded) if stage is None else None
+    settings = settings or config.stage(stage)
     sweep, ranking = read.sweep, ranking_metric(settings, read.sweep)
     shown = metric or (ranking.metric if settings.search else None)
     maximised = not minimize and (ranking.maximised or shown != ranking.metric)

@@ -1189,6 +1189,25 @@ def test_compare_refuses_a_metric_that_only_another_stage_has(
     assert f"{names.EVAL_SUCCESS} in stage b, got '{names.EVAL_DISPLACEMENT}'" in said.errors
 
 
+def test_compare_shows_the_stage_of_a_recorded_plan_as_the_report_does(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    """Also if the sweep file has no `analysis` anymore."""
+    later = {**SWEEP["stages"][0], "name": "later", "tac": {"lr": 0.002}}
+    stages = {"stages": [*SWEEP["stages"], later]}
+    planned = {"analysis": {"hypotheses": ["q = 1.5 against q = 1"], "stage": "train"}, **stages}
+    (tmp_path / "planned.yaml").write_text(yaml.safe_dump({**SWEEP, "storage": storage, **planned}))
+    assert program("plan", str(tmp_path / "planned.yaml")).code == 0
+    sweep = opened(storage, tmp_path, **stages)
+    with StateFile(sweep) as state_file:
+        for node in sweep.plan.nodes:
+            finish(sweep, state_file, node, 0.5, tmp_path / "made")
+        state_file.end("finished")
+    reported = study_of(read_sweep(f"{storage}/mine").sweep).stage
+    assert reported is not None
+    assert program("compare", f"{storage}/mine", "--json").document["stage"] == reported.name
+
+
 def test_stop_leaves_a_driver_alone_that_writes_its_report(
     storage: str, tmp_path: Path, program: Program
 ) -> None:
