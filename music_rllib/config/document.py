@@ -263,7 +263,9 @@ def lay_overrides(document: Document, overrides: Mapping[str, Any]) -> None:
     if "stages" in left:
         document.put(("stages",), left.pop("stages"))
     places: dict[str, KeyPath] = {
-        key: _place_in_stage(document, key) if key.startswith("stages.") else (*key.split("."),)
+        key: _place_in_stage(document, key)
+        if key.startswith("stages.")
+        else _parts(key, "environments", _environments(document))
         for key in left
     }
     for key in sorted(left, key=lambda key: _turn(places[key])):
@@ -354,13 +356,11 @@ def _check_not_varied(
 def _place_in_stage(document: Document, key: str) -> KeyPath:
     """The place of `stages.NAME...`; a dotted key of a grid or space is one part of it."""
     names = [str(stage.get("name")) for stage in _stages(document)]
-    rest = key.removeprefix("stages.")
-    # A stage's name may have dots.
-    name = max((name for name in names if f"{rest}.".startswith(f"{name}.")), key=len, default=None)
-    if name is None or rest == name:
+    _, name, *setting = _parts(key, "stages", names)
+    if name not in names or not setting:
         raise _refusal(f"{key} must be stages.NAME.KEY, with NAME one of {', '.join(names)}")
-    rest = rest.removeprefix(f"{name}.")
-    parts = tuple(rest.split("."))
+    rest = ".".join(setting)
+    parts = _parts(rest, "per_task", _environments(document))
     known = (*StageHeader.model_fields, *all_settings())
     if parts[0] not in known:
         raise _refusal(f"{key} {unknown(rest, known)}")
@@ -368,6 +368,20 @@ def _place_in_stage(document: Document, key: str) -> KeyPath:
         if parts[: len(group)] == group and len(parts) > len(group):
             parts = (*group, ".".join(parts[len(group) :]))
     return ("stages", names.index(name), *parts)
+
+
+def _parts(key: str, group: str, names: Iterable[str]) -> tuple[str, ...]:
+    """The parts of a dotted key; below `group`, one of `names`, which may have dots, is one."""
+    for name in sorted(names, key=len, reverse=True):
+        if f"{key}.".startswith(f"{group}.{name}."):
+            rest = key.removeprefix(f"{group}.{name}").removeprefix(".")
+            return (group, name, *filter(None, rest.split(".")))
+    return tuple(key.split("."))
+
+
+def _environments(document: Document) -> list[str]:
+    declared = find(document.data, ("environments",))
+    return [*map(str, declared)] if isinstance(declared, dict) else []
 
 
 def _stages(document: Document) -> list[dict[str, Any]]:

@@ -133,6 +133,22 @@ def test_an_override_changes_an_anchored_value_in_one_stage(tmp_path: Path) -> N
     assert [(run.tac.lr, run.tac.gamma) for run in (third, fourth)] == [(0.001, 0.9), (0.001, 0.8)]
 
 
+def test_names_of_tasks_may_have_dots(tmp_path: Path) -> None:
+    text = """
+name: s
+tasks: [Lift, Lift-1.5kg]
+environments:
+  Lift: &lift {env_id: FetchPush-v4, horizon: 50}
+  Lift-1.5kg: *lift
+stages: [{name: a.b, variant: tac}]
+"""
+    own = "stages.a.b.per_task.Lift-1.5kg.tac.lr=0.5"
+    config = load(tmp_path, own, "environments.Lift-1.5kg.horizon=20", text=text)
+    first, second = config.stages[0].points[0].runs.values()
+    assert (first.task.horizon, second.task.horizon) == (50, 20)
+    assert (first.tac.lr, second.tac.lr) == (1e-3, 0.5)
+
+
 @pytest.mark.parametrize("prefix", ["", "stages.first.", "stages.first.per_task.FetchReach."])
 def test_a_group_replaces_only_its_fields(tmp_path: Path, prefix: str) -> None:
     before = runs(load(tmp_path))[0]
