@@ -3,7 +3,8 @@
 This is the program of a child process, since an environment may abort, end or block its process.
 `music_rllib.sweep.preflight` starts it with a folder. It reads a `Request` from the file `request`
 and appends JSON lines to the file `answers`: `["call", task, name]` before a call of an environment
-(at most once a second for repeated calls) and `["done", task, problems, remarks, sizes]` for each task.
+(at most once a second for repeated calls) and `["done", task, problems, remarks, sizes]` for each
+task.
 """
 
 from __future__ import annotations

@@ -136,7 +136,7 @@ class Plan:
 
     @property
     def transfers(self) -> list[tuple[Task, Task]]:
-        """The task of the source and of the run, if a stage takes over the agent of another task."""
+        """The source's and the run's task, of stages that take over the agent of another task."""
         return [
             (stage.source.task, task)
             for stage in self._stages.values()

@@ -46,8 +46,8 @@ _HUMAN = "env_kwargs: {render_mode: human} needs a display; leave it out for tra
 def check_environments(plan: Plan, hang_minutes: float | None = None) -> list[str]:
     """Play each declared environment in a child process, and check that its task describes it.
 
-    Also play the tasks between which agents are transferred, whose sizes must be equal. One call of an environment may take `hang_minutes`; None: no limit. Returns remarks, one line
-    each.
+    Also play the tasks between which agents are transferred, whose sizes must be equal. One call of
+    an environment may take `hang_minutes`; None: no limit. Returns remarks, one line each.
 
     Raises:
         BadInputError: A task does not fit; with one line per problem, and the remarks.
