@@ -282,6 +282,10 @@ def _attach(opened: OpenSweep, folder: Path, made: SweepReport) -> None:
     typer.echo(f"Attached to the sweep's run in MLflow: {run.page}")
 
 
+MOST_NOTE = 7500
+"""Longest text and table of a description in MLflow, whose tags have at most 8,000 characters."""
+
+
 def _note(answer: str, made: SweepReport, run_id: str) -> str:
     """The answer, the last stage's final values and a figure, in Markdown for MLflow's page."""
     from music_rllib.results.tables import performance_tables
@@ -297,6 +301,12 @@ def _note(answer: str, made: SweepReport, run_id: str) -> str:
         lines += ["".join(f"| {_escaped(text)}&emsp;" for text in row) + "|" for row in rows]
         lines.insert(3, "|---" * len(titles) + "|")
     drawn = sorted(made.drawings, key=lambda drawing: drawing.stage != last)
+    count = len(lines)
+    # MLflow would cut off the end, which is the figure.
+    while sum(map(len, lines)) + len(lines) > MOST_NOTE and len(lines) > 4:
+        lines.pop()
+    if count > len(lines):
+        lines += ["", f"The report has {count - len(lines)} more rows."]
     if drawn:
         figure = f"report/figures/{drawn[0].name}.png"
         # MLflow serves its pages and its artifacts from the same origin.

@@ -92,10 +92,11 @@ def compute_and_report(
         controller = None
         if opened.plan.searched:
             controller = begin_searches(opened, display, mlflow_log, state_file, alone=not shares)
-        tracker.keep_current(node.key for node in opened.plan.nodes)
+        if not shares:  # otherwise the plan lacks the trials that others are running
+            tracker.keep_current(node.key for node in opened.plan.nodes)
+        mlflow_log.postpones = True  # other drivers may join, and log what they compute
         stopped_by = _compute(opened, display, mlflow_log, state_file, controller, wait_minutes)
         searches = [] if controller is None else end_searches(opened, controller, tracker)
-        tracker.keep_current(node.key for node in opened.plan.nodes)  # with trials since then
         # Trials that failed because a run failed, under earlier drivers too.
         lost = sum(t["lost"] for one in searches for arm in one["arms"] for t in arm["trials"])
         failed = (
@@ -113,6 +114,7 @@ def compute_and_report(
     with contextlib.nullcontext() if stopped_by else alone(opened.location, display.say):
         if not drivers.others():
             mlflow_log.log_postponed()
+            tracker.keep_current(node.key for node in opened.plan.nodes)  # with trials since then
         tracker.close(
             "KILLED" if stopped_by else "FAILED" if failed else "FINISHED",
             say=None if stopped_by else say_left,

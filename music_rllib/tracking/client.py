@@ -278,7 +278,8 @@ class Experiment:
         run = self.client.get_run(run_id)
         fresh = {name: value for name, value in params.items() if name not in run.data.params}
         self.log(run_id, tags=tags, params=fresh)
-        for tag in {names.TAG_FAILURE, names.TAG_PRUNED} & run.data.tags.keys() - tags.keys():
+        ended = {names.TAG_FAILURE, names.TAG_PRUNED, names.TAG_PART}
+        for tag in ended & run.data.tags.keys() - tags.keys():
             self.remove_tag(run_id, tag)
         if run.info.status != "RUNNING":
             self.client.update_run(run_id, status="RUNNING")

@@ -200,7 +200,8 @@ class RunQueue:
         tags = {**self._tags(), **tags}
         if self._has_begun:
             return {}, tags
-        self._experiment.begin_run(run_id, tags, params)
+        # The plan may have changed since the run began, and its name has what varies.
+        self._experiment.begin_run(run_id, {**tags, MLFLOW_RUN_NAME: self._info.name}, params)
         return {}, {}
 
     def _send_end(self, status: Status, time: int, tags: Mapping[str, str]) -> None:

@@ -58,6 +58,8 @@ class Sender(Thread):
         self._change = threading.Condition()
         self._has_news = self._flushing = self._stopped = self._failed = False
         self._failures = 0
+        self._delayed: set[RunQueue] = set()
+        """Runs whose last attempt failed; they come last."""
         self._succeeded = -math.inf
         """Time of the last success."""
         self._error: str | None = None
@@ -131,7 +133,7 @@ class Sender(Thread):
         with self._change:
             runs = [run for run in self._runs if run.refused is None]
         # Metrics of running runs before those of finished ones, and policies at last.
-        runs.sort(key=lambda run: not run.is_running)
+        runs.sort(key=lambda run: (run in self._delayed, not run.is_running))
         self._failed = False
         for policies in (False, True):
             left = runs
@@ -191,8 +193,10 @@ class Sender(Thread):
                     )
                 self._failures, self._error = self._failures + (not self._failed), reason
                 self._failed = True
+                self._delayed.add(run)
                 self._runs[run] = self._runs.pop(run)
         else:
+            self._delayed.discard(run)
             run.unclear_since, self._succeeded = None, time.monotonic()
 
     def _has_lasted(self, run: RunQueue) -> bool:

@@ -234,11 +234,15 @@ def mlflow_version(store: TrackingStore) -> str | None:
 def _get(store: TrackingStore, page: str) -> requests.Response:
     import requests
     from mlflow import environment_variables as mlflow_variables
+    from mlflow.utils.credentials import get_default_host_creds
 
+    known = get_default_host_creds(store.uri)  # a server may require them for its version
     insecure = mlflow_variables.MLFLOW_TRACKING_INSECURE_TLS.get()
     return requests.get(
         f"{store.uri.rstrip('/')}/{page}",
         timeout=(CONNECT_SECONDS, ANSWER_SECONDS),
+        auth=(known.username, known.password) if known.username and known.password else None,
+        headers={"Authorization": f"Bearer {known.token}"} if known.token else None,
         verify=not insecure and (mlflow_variables.MLFLOW_TRACKING_SERVER_CERT_PATH.get() or True),
         cert=mlflow_variables.MLFLOW_TRACKING_CLIENT_CERT_PATH.get(),
     )

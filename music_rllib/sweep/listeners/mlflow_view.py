@@ -7,12 +7,14 @@ MLflow keeps the result of *Save view* as a tag of the experiment, and opens it 
 from __future__ import annotations
 
 import json
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 from music_rllib import names
 from music_rllib.config.schema import Stage
 from music_rllib.experiment.plan import Plan
+from music_rllib.redaction import flat_params
 from music_rllib.results.conditions import IN_WORDS
 
 VERSIONS = ("3.17", "3.18")
@@ -27,8 +29,7 @@ def comparison_view(plan: Plan, stage: Stage, sweep_id: str, now: float) -> str:
 
     `sweep_id` is the value of its runs' tag of this name, `now` is in seconds since the epoch.
     """
-    runs = [node.run for node in plan.nodes]
-    tasks = list({run.task.name: run.task for run in runs}.values())
+    tasks = stage.tasks
     metrics = list(dict.fromkeys((*(task.primary_metric for task in tasks), *METRICS)))
     varied = {name for node in plan.nodes if node.stage == stage.name for name in node.values}
     if stage.search is not None:  # none of its trials is planned yet
@@ -54,7 +55,10 @@ def comparison_view(plan: Plan, stage: Stage, sweep_id: str, now: float) -> str:
         "isAccordionReordered": True,
         "groupBy": {
             "aggregateFunction": "average",
-            "groupByKeys": [{"mode": "tag", "groupByData": tag} for tag in dict.fromkeys(tags)],
+            "groupByKeys": [
+                *({"mode": "tag", "groupByData": tag} for tag in dict.fromkeys(tags)),
+                *({"mode": "param", "groupByData": name} for name in _varied(plan, stage)),
+            ],
         },
         "useGroupedValuesInCharts": True,
         "hideEmptyCharts": True,
@@ -62,6 +66,16 @@ def comparison_view(plan: Plan, stage: Stage, sweep_id: str, now: float) -> str:
     when = round(now * 1000)
     view = {"name": f"{plan.name}: comparison", "createdAt": when, "updatedAt": when}
     return json.dumps({**view, "state": json.dumps(state, separators=(",", ":"))})
+
+
+def _varied(plan: Plan, stage: Stage) -> list[str]:
+    """Params that vary in a stage and that no tag has in full, such as the start of a schedule."""
+    seen: defaultdict[tuple[str, str], set[str]] = defaultdict(set)
+    for run in (node.run for node in plan.nodes if node.stage == stage.name and not node.part):
+        settings = run.model_dump(mode="json", exclude={"task", "seed"})
+        for name, text in flat_params(settings).items():
+            seen[run.task.name, name].add(text)
+    return sorted({name for (_, name), of in seen.items() if len(of) > 1 and name not in IN_WORDS})
 
 
 def _charts(metrics: Sequence[str]) -> Iterator[dict[str, Any]]:

@@ -79,8 +79,16 @@ class PrometheusListener(Listener):
         self._gauges: dict[str, Any] = {}
         self._values: dict[str, tuple[dict[str, str], dict[str, float]]] = {}
         """Node key to tags and values by gauge."""
+        self._in_workers: set[str] = set()
+        """Keys of nodes whose run a worker has started; other started nodes wait for resources."""
         self._ended: dict[str, None] = {}
         """Keys of ended nodes, in the order of their ends."""
+
+    def started(self, node: Node) -> None:
+        self._in_workers.add(node.key)
+
+    def left(self, node: Node, holder: str) -> None:
+        self._in_workers.discard(node.key)
 
     def reported(self, node: Node, reports: list[Report]) -> None:
         self._ended.pop(node.key, None)
@@ -95,6 +103,7 @@ class PrometheusListener(Listener):
         self._end(node)
 
     def paused(self, node: Node) -> None:
+        self._in_workers.discard(node.key)
         self._end(node)
 
     def tick(self) -> None:
@@ -136,8 +145,12 @@ class PrometheusListener(Listener):
             for gauge, value in values.items():
                 self._gauges[gauge].set(value, tags=tags)
         tags = {"sweep": self._sweep}
-        for status in Status:
-            count = len(self._scheduler.having(status))
+        counts = {status: len(self._scheduler.having(status)) for status in Status}
+        started = self._scheduler.having(Status.STARTED)
+        queued = sum(node.key not in self._in_workers for node in started)
+        counts[Status.STARTED] -= queued
+        counts[Status.WAITING] += queued
+        for status, count in counts.items():
             self._gauges["music_runs"].set(count, tags=tags | {"state": status.value})
         pending = self._pending()
         self._gauges["music_undelivered_records"].set(pending.records, tags=tags)

@@ -28,8 +28,8 @@ def exported(monkeypatch: pytest.MonkeyPatch) -> dict[str, dict[str, float]]:
             self.name = name
 
         def set(self, value: float, tags: dict[str, str]) -> None:
-            if "run" in tags:
-                found.setdefault(self.name, {})[tags["run"]] = value
+            if key := tags.get("run") or tags.get("state"):
+                found.setdefault(self.name, {})[key] = value
 
     monkeypatch.setattr(ray.util.metrics, "Gauge", Gauge)
     monkeypatch.setattr(ray, "nodes", list)
@@ -79,3 +79,16 @@ def test_what_is_exported_does_not_grow_with_the_runs_that_ended(
         node.label: 0.75 if node is paused else 0.5 for node in kept
     }
     assert exported["music_env_steps"][paused.label] == 400.0
+
+
+def test_a_run_that_waits_for_cpus_is_not_exported_as_started(
+    exported: dict[str, dict[str, float]], plan: Plan, tmp_path: Path
+) -> None:
+    scheduler = Scheduler(plan, set())
+    listener = PrometheusListener("s", scheduler, lambda: Pending(records=0, error=None), tmp_path)
+    for node in plan.nodes[:3]:
+        scheduler.start(node.key)  # passed to Ray Tune
+    listener.started(plan.nodes[0])  # by a worker
+    listener.tick()
+    runs = exported["music_runs"]
+    assert (runs["started"], runs["waiting"]) == (1, 7), "as in `status`"

@@ -19,8 +19,9 @@ from tests.processes import wait_until
 class Failing(RunQueue):
     """A record that MLflow takes after some failures."""
 
-    def __init__(self, code: int, failures: int) -> None:
-        super().__init__(Experiment.__new__(Experiment), "a")
+    def __init__(self, code: int, failures: int, key: str = "a", *, is_running: bool = False):
+        super().__init__(Experiment.__new__(Experiment), key)
+        self.is_running = is_running
         self.code, self.failures, self.attempts = code, failures, 0
         self._info = type("Info", (), {"source_node": None})()
         self._records.append(lambda: None)
@@ -66,8 +67,7 @@ def test_a_failure_that_may_pass_loses_nothing(
 
 
 def test_what_a_server_lacks_does_not_delay_other_runs(started: Sender) -> None:
-    run, other = Failing(codes.ENDPOINT_NOT_FOUND, 10**6), Failing(codes.BAD_REQUEST, 0)
-    other.node_key = "b"
+    run, other = Failing(codes.ENDPOINT_NOT_FOUND, 10**6), Failing(codes.BAD_REQUEST, 0, "b")
     started.add(run)
     wait_until(lambda: run.attempts > 2, 10)
     started.add(other)
@@ -75,3 +75,11 @@ def test_what_a_server_lacks_does_not_delay_other_runs(started: Sender) -> None:
     wait_until(lambda: run.refused is not None, 10)
     assert not other.records
     assert time.monotonic() - begin < 0.8, "others succeed, so the failure is not the server's"
+
+
+def test_a_running_run_that_fails_does_not_delay_finished_ones(started: Sender) -> None:
+    """The sweep's own run has artifacts, so it fails as long as they cannot be stored."""
+    finished = Failing(codes.BAD_REQUEST, 0, "b")
+    started.add(Failing(codes.INTERNAL_ERROR, 10**6, is_running=True))
+    started.add(finished)
+    wait_until(lambda: not finished.records, 10)

@@ -6,6 +6,7 @@ import os
 import socket
 import threading
 import time
+from base64 import b64encode
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -20,15 +21,26 @@ from music_rllib.errors import TrackingError
 from music_rllib.store.storage import database_url, sqlite_url
 from music_rllib.tracking import sender
 from music_rllib.tracking import store as store_module
-from music_rllib.tracking.store import RECORD, SweepRecord, check_reachable, resolve_store
+from music_rllib.tracking.store import (
+    RECORD,
+    SweepRecord,
+    check_reachable,
+    mlflow_version,
+    resolve_store,
+)
 from tests.ports import free_port
 
 
 @contextmanager
-def server_that_answers(status: int, body: bytes) -> Iterator[str]:
+def server_that_answers(
+    status: int, body: bytes, user: tuple[str, str] | None = None
+) -> Iterator[str]:
+    wanted = f"Basic {b64encode(':'.join(user).encode()).decode()}" if user else None
+
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
-            self.send_response(status)
+            is_known = self.headers.get("Authorization") == wanted
+            self.send_response(status if is_known else 401)
             self.end_headers()
             self.wfile.write(body)
 
@@ -284,3 +296,11 @@ def test_policies_are_sent_although_metrics_never_pause() -> None:
         assert thread._send_round()
         assert thread.pending().records == left
     assert [run.node_key for run in thread._runs] == ["training"]
+
+
+def test_the_version_is_asked_for_with_mlflows_credentials(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A server with basic authentication answers /health without them, but not /version."""
+    monkeypatch.setenv("MLFLOW_TRACKING_USERNAME", "me")
+    monkeypatch.setenv("MLFLOW_TRACKING_PASSWORD", "a-word")
+    with server_that_answers(200, b"3.17.2", ("me", "a-word")) as address:
+        assert mlflow_version(resolve_store(address, "results")) == "3.17.2"
