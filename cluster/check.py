@@ -381,12 +381,12 @@ def check_serve(document: dict[str, Any], _: Path) -> Problems:
     yield from check_placeholders(document)
     try:
         # Serve itself ignores unknown keys, for compatibility with its later versions.
-        known = ServeDeploySchema.model_validate(document).model_dump(exclude_unset=True)
-        yield from _unknown(document, known)
+        given = ServeDeploySchema.model_validate(document)
+        yield from _unknown(document, given.model_dump(exclude_unset=True))
     except ValidationError as error:
         yield from _findings(error)
         return
-    host = (document.get("http_options") or {}).get("host", "127.0.0.1")
+    host = given.http_options.host  # all addresses if the file names none
     for index, application in enumerate(document["applications"]):
         place = f"applications.{index}.args"
         try:
@@ -469,21 +469,34 @@ def check_kustomization(document: dict[str, Any], path: Path, crds: Crds | None 
         if not there and "://" not in str(resource):
             place = f"resources.{index}"
             yield f"{place}: {resource} must be a file or a folder with kustomization.yaml"
-    files = [file for one in document["resources"] for file in (path.parent / one).glob("*.yaml")]
-    objects = [yaml.safe_load(file.read_text(encoding="utf-8")) for file in files]
+    objects = _objects(document["resources"], path.parent)
     for index, entry in enumerate(document.get("patches", ())):
-        patch = yaml.safe_load(entry["patch"])
-        patched = [one for one in objects if _is_same(one, patch)]
+        patch = yaml.safe_load(entry.get("patch", ""))
+        # A patch in a file of its own, with a target or of operations is checked by kubectl alone.
+        if not isinstance(patch, dict) or "target" in entry:
+            continue
+        patched = [one for one in objects if _named(one) == _named(patch)]
         if not patched:
             yield f"patches.{index}: must be of an object of the resources"
         for one in patched:
-            for problem in check_kuberay(_merged(one, patch), path, crds):
+            for problem in check_document(_merged(one, patch), path, crds):
                 yield f"patches.{index}: {problem}"
 
 
-def _is_same(one: dict[str, Any], other: dict[str, Any]) -> bool:
-    named = one.get("metadata", {}).get("name") == other["metadata"]["name"]
-    return bool(named and one.get("kind") == other["kind"])
+def _objects(resources: Any, folder: Path) -> list[dict[str, Any]]:
+    """The objects of a kustomization's resources, also of other kustomizations."""
+    objects = []
+    for target in (folder / str(one) for one in resources):
+        if target.is_file():
+            objects += yaml.safe_load_all(target.read_text(encoding="utf-8"))
+        elif (inner := target / "kustomization.yaml").is_file():
+            inner_document = yaml.safe_load(inner.read_text(encoding="utf-8"))
+            objects += _objects(inner_document["resources"], target)
+    return [one for one in objects if isinstance(one, dict)]
+
+
+def _named(one: dict[str, Any]) -> tuple[Any, Any]:
+    return one.get("kind"), (one.get("metadata") or {}).get("name")
 
 
 def _merged(document: Any, patch: Any) -> Any:

@@ -73,6 +73,11 @@ class Resources(StrictModel):
             raise ValueError(
                 f"cpus_per_run must be <= num_cpus ({self.num_cpus}), got {self.cpus_per_run}"
             )
+        if self.gpus_per_run > 1 and not self.gpus_per_run.is_integer():
+            raise ValueError(
+                "gpus_per_run must be a whole number above 1, because a part of a GPU is of one "
+                f"GPU, got {self.gpus_per_run:g}"
+            )
         return self
 
 

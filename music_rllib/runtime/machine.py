@@ -41,8 +41,8 @@ RAY_FOLDER = "mr-"
 LONGEST_SOCKET = len(
     f"/{RAY_FOLDER}12345678/r/session_2026-11-26_07-59-49_813210_4194304/sockets/plasma_store"
 )
-MEMORY_LIMITS = ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory.max")
-"""Files with a container's memory limit, of both versions of cgroups."""
+OWN_CGROUPS = Path("/proc/self/cgroup")
+CGROUPS = Path("/sys/fs/cgroup")
 
 
 class ClusterError(BadInputError, RuntimeError):
@@ -165,7 +165,7 @@ def check_cpus(resources: Resources) -> int | None:
     """
     if cluster_address() is not None:
         return None
-    here = len(os.sched_getaffinity(0))
+    here = cpus_here()
     for name in ("num_cpus", "cpus_per_run"):
         asked = getattr(resources, name)
         if asked is not None and asked > here:
@@ -196,17 +196,48 @@ def check_memory_and_gpus(resources: Resources) -> None:
         )
 
 
+def cpus_here() -> int:
+    """Number of CPUs of this process for a local Ray.
+
+    The share of a container counts, and that of `taskset` or of a job of Slurm.
+    """
+    shares = [float(len(os.sched_getaffinity(0)))]
+    for text in _limits("cpu", "cpu.max"):
+        quota, _, period = text.partition(" ")
+        if quota.isdecimal():  # or "max"
+            shares.append(int(quota) / int(period))
+    quotas, periods = _limits("cpu", "cpu.cfs_quota_us"), _limits("cpu", "cpu.cfs_period_us")
+    for quota, period in zip(quotas, periods, strict=True):
+        if quota.isdecimal():  # or -1
+            shares.append(int(quota) / int(period))
+    return max(1, int(min(shares)))
+
+
 def memory() -> int:
-    """Bytes of memory of this machine or container."""
+    """Bytes of memory of this machine, container, or job of a batch system."""
     limits = [int(psutil.virtual_memory().total)]
-    for place in MEMORY_LIMITS:
-        try:
-            text = Path(place).read_text().strip()
-        except OSError:
-            continue
-        if text.isdecimal():  # or "max"
-            limits.append(int(text))
+    for file in ("memory.limit_in_bytes", "memory.max"):
+        limits += [int(text) for text in _limits("memory", file) if text.isdecimal()]  # or "max"
     return min(limits)
+
+
+def _limits(controller: str, file: str) -> list[str]:
+    """The limits of a kind for this process's cgroup and those above, of both versions of cgroups.
+
+    A container often sees only its own, as the top one. Slurm and systemd have one for each job.
+    """
+    found = []
+    for line in OWN_CGROUPS.read_text().splitlines() if OWN_CGROUPS.exists() else ():
+        _, controllers, path = line.split(":", 2)
+        if controllers and controller not in controllers.split(","):
+            continue
+        top = CGROUPS / controller if controllers else CGROUPS
+        group = top / path.strip("/")
+        for folder in (group, *group.parents):
+            if folder.is_relative_to(top):
+                with contextlib.suppress(OSError):
+                    found.append((folder / file).read_text().strip())
+    return found
 
 
 @cache

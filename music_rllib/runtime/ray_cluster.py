@@ -14,7 +14,6 @@ from typing import Any
 
 import psutil
 import ray
-from ray._private.utils import get_num_cpus
 
 from music_rllib.config.schema import Resources
 from music_rllib.envs.tasks import folders_for_workers, search_in
@@ -25,6 +24,7 @@ from music_rllib.runtime.machine import (
     RayStartError,
     check_cpus,
     cluster_address,
+    cpus_here,
     free_memory,
     own_folder,
     ray_parent,
@@ -168,15 +168,6 @@ def cluster(
         stop_ray()
 
 
-def cpus_here() -> int:
-    """Number of CPUs of this process for a local Ray.
-
-    Ray itself counts the share of a container, and not that of `taskset` or of a job of Slurm.
-    """
-    share = int(get_num_cpus(override_docker_cpu_warning=True))
-    return max(1, min(len(os.sched_getaffinity(0)), share))
-
-
 def _wait_for_nodes(
     resources: Resources, wait_minutes: float | None, say: Callable[[str], None]
 ) -> Capacity:
@@ -228,7 +219,7 @@ def slots(resources: Resources, nodes: Sequence[Mapping[str, float]], *, local: 
     """
     bundle = resources.bundle
     count = sum(
-        min(int(node.get(name, 0) / amount + 1e-9) for name, amount in bundle.items())
+        min(_held(name, node.get(name, 0), amount) for name, amount in bundle.items())
         for node in nodes
     )
     if count:
@@ -246,6 +237,13 @@ def slots(resources: Resources, nodes: Sequence[Mapping[str, float]], *, local: 
         "resources must fit into one node; each of them is on some node, but all together "
         f"({', '.join(f'{name} {amount:g}' for name, amount in bundle.items())}) on none"
     )
+
+
+def _held(name: str, here: float, amount: float) -> int:
+    """How often `amount` of a resource fits; a part of a GPU is a part of one GPU."""
+    if name == "GPU" and amount < 1:
+        return int(here) * int(1 / amount + 1e-9)
+    return int(here / amount + 1e-9)
 
 
 _SETTINGS = {

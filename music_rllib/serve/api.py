@@ -18,6 +18,7 @@ from fastapi import Body, Depends, FastAPI, HTTPException, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+from fastapi.security.utils import get_authorization_scheme_param
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, create_model, model_validator
 from starlette.exceptions import HTTPException as StarletteHTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -206,7 +207,7 @@ def make_api(facts: PolicyFacts, act: Act, token_sha256: str | None = None) -> F
     )
     most_bytes = 4096 + 64 * facts.max_rows * sum(facts.parts.values())
     # Without a token the service listens on loopback only.
-    api.add_middleware(_Lenient, most_bytes=most_bytes, own_host=not token_sha256)
+    api.add_middleware(_Lenient, most_bytes=most_bytes, token_sha256=token_sha256)
     api.add_exception_handler(RequestValidationError, _invalid)
     api.add_exception_handler(StarletteHTTPException, _refused)
     protected, unauthorized = [], Responses()
@@ -256,12 +257,17 @@ def _bearer(expected: str) -> Callable[..., None]:
     """A check of the bearer token against the expected `token_hash`."""
 
     def check(given: Annotated[HTTPAuthorizationCredentials | None, Depends(_SCHEME)]) -> None:
-        if given is None or not hmac.compare_digest(token_hash(given.credentials), expected):
-            raise HTTPException(
-                401, "a valid bearer token is needed", headers={"WWW-Authenticate": "Bearer"}
-            )
+        _check_token("" if given is None else given.credentials, expected)
 
     return check
+
+
+def _check_token(token: str, expected: str) -> None:
+    """Answer with 401 unless `token` has the expected `token_hash`."""
+    if not hmac.compare_digest(token_hash(token), expected):
+        raise HTTPException(
+            401, "a valid bearer token is needed", headers={"WWW-Authenticate": "Bearer"}
+        )
 
 
 async def _refused(_: Request, error: Exception) -> JSONResponse:
@@ -301,13 +307,14 @@ def _is_loopback(host: str) -> bool:
 class _Lenient:
     """Middleware that treats HEAD as GET and any body as JSON, and rejects too long bodies.
 
-    With `own_host` it also rejects requests whose Host header names another machine.
+    Without a token it also rejects requests whose Host header names another machine. With one, a
+    body from a client without it is received and not parsed, which FastAPI would do first.
     """
 
-    def __init__(self, app: ASGIApp, most_bytes: int, *, own_host: bool) -> None:
+    def __init__(self, app: ASGIApp, most_bytes: int, token_sha256: str | None) -> None:
         self._app = app
         self._most_bytes = most_bytes
-        self._own_host = own_host
+        self._token_sha256 = token_sha256
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -321,10 +328,17 @@ class _Lenient:
             received += len(message.get("body", b""))
             if received > self._most_bytes:
                 raise HTTPException(413, f"the body must be <= {self._most_bytes} bytes")
+            # Only at its end: slow clients occupy a place, and get 408 or 503 like others.
+            ends = message["type"] == "http.request" and not message.get("more_body", False)
+            if ends and self._token_sha256:
+                _check_token(token, self._token_sha256)
             return message
 
-        host = dict(scope["headers"]).get(b"host", b"").decode("latin-1")
-        if self._own_host and not _is_loopback(host):
+        given = {name: value.decode("latin-1") for name, value in scope["headers"]}
+        host = given.get(b"host", "")
+        scheme, token = get_authorization_scheme_param(given.get(b"authorization"))
+        token = token if scheme.lower() == "bearer" else ""
+        if not self._token_sha256 and not _is_loopback(host):
             # Another host name that resolves to this machine is an attack (DNS rebinding).
             failure = Failure(error=f"the Host header must name this machine, got {host!r}")
             await JSONResponse(failure.model_dump(), 403)(scope, receive, send)

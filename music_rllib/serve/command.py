@@ -15,7 +15,7 @@ import typer
 
 from music_rllib.errors import BadInputError
 from music_rllib.redaction import redact
-from music_rllib.runtime.machine import check_reachable, cluster_address
+from music_rllib.runtime.machine import check_reachable, cluster_address, cpus_here
 from music_rllib.runtime.process import handle_signals
 from music_rllib.serve import TOKEN_VARIABLE, given_token
 
@@ -83,7 +83,7 @@ def serve(
         raise BadInputError(
             f"Ray Serve must be installed (pip install 'music_rllib[serve]'): {error}"
         ) from error
-    from music_rllib.runtime.ray_cluster import cpus_here, start_ray, stop_ray
+    from music_rllib.runtime.ray_cluster import start_ray, stop_ray
     from music_rllib.serve.application import ServeSettings, application, policy_of
 
     settings = ServeSettings(

@@ -501,6 +501,65 @@ def test_kustomize_puts_the_objects_together() -> None:
         assert kinds == {"PersistentVolumeClaim", {"raycluster": "RayCluster"}.get(name, "RayJob")}
 
 
+@pytest.mark.parametrize("options", [{"port": 8000}, None])
+def test_a_service_without_a_host_listens_beyond_loopback(options: Any) -> None:
+    document = load("serve.yaml")
+    document["http_options"] = options or {}
+    if options is None:
+        del document["http_options"]
+    document["applications"][0]["args"]["token_required"] = False
+    (problem,) = check_document(document, CLUSTER / "serve.yaml")
+    assert "token_required: must be true" in problem
+
+
+PATCH = """
+  - patch: |
+      apiVersion: {version}
+      kind: {kind}
+      metadata: {{name: {name}}}
+      spec: {spec}
+"""
+OF_CLUSTER = PATCH.replace("{version}", "ray.io/v1").replace("{kind}", "RayCluster")
+OF_CLAIM = PATCH.replace("{version}", "v1").replace("{kind}", "PersistentVolumeClaim")
+RESULTS = "music-rllib-results"
+OPERATIONS = """
+  - target: {kind: RayCluster}
+    patch: |
+      - {op: remove, path: /spec/x}
+"""
+
+
+@pytest.mark.parametrize(
+    ("folder", "patch", "expected"),
+    [
+        (
+            "raycluster",
+            OF_CLUSTER.format(name="music-rllib", spec="{autoscalerOptions: {version: v2}}"),
+            None,
+        ),
+        (
+            "raycluster",
+            OF_CLUSTER.format(name="music-rllib", spec="{autoscalerOption: {}}"),
+            "autoscalerOption",
+        ),
+        ("raycluster-1.7", OF_CLAIM.format(name=RESULTS, spec="{accessModes: [X]}"), None),
+        ("raycluster-1.7", OF_CLAIM.format(name=RESULTS, spec="{accessMode: x}"), "accessMode"),
+        ("raycluster", OF_CLAIM.format(name="other", spec="{}"), "must be of an object"),
+        ("raycluster", "\n  - {path: mine.yaml}\n", None),
+        ("raycluster", OPERATIONS, None),
+    ],
+)
+def test_patches_of_a_kustomization(
+    folder: str, patch: str, expected: str | None, tmp_path: Path
+) -> None:
+    shutil.copytree(CLUSTER / "kuberay", tmp_path / "kuberay")
+    file = tmp_path / "kuberay" / folder / "kustomization.yaml"
+    text = file.read_text().rstrip("\n")
+    file.write_text(text + ("" if "\npatches:" in text else "\npatches:") + patch)
+    problems = check_file(file)
+    assert [expected in problem for problem in problems] == [True] * (expected is not None)
+
+
 def test_grafana_finds_its_dashboards_and_prometheus() -> None:
     """At the addresses in the files of `dashboards/`, with the names that compose gives."""
     services = load("compose.yaml")["services"]

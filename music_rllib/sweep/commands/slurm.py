@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from music_rllib.errors import BadInputError
+from music_rllib.errors import FAILED, BadInputError
 from music_rllib.sweep.commands.run import Name, Overrides, Seeds, SweepStorage
 
 EXAMPLES = """\
@@ -105,7 +105,16 @@ def slurm(
             typer.echo(f"  sbatch {shlex.join([*job, str(script)])}")
         return 0
     array_job = _submit([*jobs[0], str(script)])
-    last = _submit([f"--dependency=afterany:{array_job}", str(script)])
+    after = [f"--dependency=afterany:{array_job}", str(script)]
+    try:
+        last = _submit(after)
+    except BadInputError as error:
+        error.exit_code = FAILED  # something was started
+        error.args = (
+            f"{error}. Job {array_job} ({array} tasks) is submitted; submit the job that logs all "
+            f"runs to MLflow and writes the report later: sbatch {shlex.join(after)}",
+        )
+        raise
     typer.echo(f"Submitted: job {array_job} ({array} tasks), then job {last} (MLflow and report).")
     return 0
 

@@ -18,7 +18,7 @@ import pytest
 import ray
 
 from music_rllib.config.schema import Resources
-from music_rllib.runtime import ray_cluster
+from music_rllib.runtime import machine, ray_cluster
 from music_rllib.runtime.machine import ClusterError, own_folder, ray_parent
 from music_rllib.runtime.ray_cluster import WAITING, Capacity, _capacity, slots
 from tests.processes import fresh
@@ -183,7 +183,54 @@ def test_a_run_that_can_never_fit_is_refused(settings: dict[str, Any], message: 
         slots(Resources(**settings), [SMALL, BIG], local=False)
 
 
-def test_a_local_ray_has_the_cpus_of_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+def put_limits(
+    monkeypatch: pytest.MonkeyPatch, folder: Path, cpus: str, memory: str, job: str = ""
+) -> None:
+    """Replace this process's cgroup by one of version 2 with these limits."""
+    (folder / "cgroup" / job).mkdir(parents=True, exist_ok=True)
+    (folder / "cgroup" / job / "cpu.max").write_text(cpus)
+    (folder / "cgroup" / job / "memory.max").write_text(memory)
+    (folder / "own").write_text(f"0::/{job}\n")
+    monkeypatch.setattr(machine, "CGROUPS", folder / "cgroup")
+    monkeypatch.setattr(machine, "OWN_CGROUPS", folder / "own")
+
+
+def test_a_run_that_needs_more_cpus_than_the_container_has_is_refused_before_it_is_recorded(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {*range(64)})
+    put_limits(monkeypatch, tmp_path, "200000 100000", "max")
+    for settings in ({"cpus_per_run": 4}, {"num_cpus": 4}):
+        with pytest.raises(ClusterError, match="must be <= 2, the CPUs of this machine, got 4"):
+            machine.check_cpus(Resources(**settings))
+    assert machine.check_cpus(Resources(cpus_per_run=2, num_cpus=2)) == 2
+
+
+def test_the_memory_is_that_of_a_batch_systems_job(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Also if the process is in a step of the job, which has no limit of its own."""
+    put_limits(monkeypatch, tmp_path, "max 100000", str(2**30), "slurm/job_7")
+    assert machine.memory() == 2**30
+    put_limits(monkeypatch, tmp_path, "max 100000", "max", "slurm/job_7/step_0/task_0")
+    assert machine.memory() == 2**30
+    (tmp_path / "own").write_text("4:memory:/slurm/job_8\n0::/\n")
+    (tmp_path / "cgroup/memory/slurm/job_8").mkdir(parents=True)
+    (tmp_path / "cgroup/memory/slurm/job_8/memory.limit_in_bytes").write_text("4096\n")
+    assert machine.memory() == 4096
+
+
+def test_a_part_of_a_gpu_is_of_one_gpu() -> None:
+    assert slots(Resources(gpus_per_run=0.4), [{"CPU": 64.0, "GPU": 2.0}], local=False) == 4
+    assert slots(Resources(gpus_per_run=0.3), [{"CPU": 64.0, "GPU": 8.0}], local=False) == 24
+    with pytest.raises(ValueError, match="gpus_per_run must be a whole number above 1"):
+        Resources(gpus_per_run=1.5)
+
+
+def test_a_local_ray_has_the_cpus_of_this_process(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     """Ray itself would count those that `taskset` or Slurm gives to others."""
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     started: list[int] = []
@@ -191,7 +238,7 @@ def test_a_local_ray_has_the_cpus_of_this_process(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(ray_cluster, "_wait_for_nodes", lambda *_: None)
     for affinity, share, asked in ((8, 128, None), (128, 2, None), (8, 128, 2)):
         monkeypatch.setattr(os, "sched_getaffinity", lambda _, count=affinity: {*range(count)})
-        monkeypatch.setattr(ray_cluster, "get_num_cpus", lambda count=share, **_: count)
+        put_limits(monkeypatch, tmp_path, f"{share}00000 100000", "max")
         with ray_cluster.cluster(Resources(num_cpus=asked)):
             pass
     assert started == [8, 2, 2]

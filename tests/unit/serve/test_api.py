@@ -239,6 +239,31 @@ def test_a_token_is_required_if_there_is_one() -> None:
         assert "hunter2" not in requests.get(f"{url}/openapi.json", timeout=60).text
 
 
+@pytest.mark.parametrize("body", [b"{nope", b"", b"\xff\xfe", b"[" * 100_000])
+def test_a_body_is_not_judged_without_the_token(body: bytes) -> None:
+    with serving(token="secret") as url:
+        for headers in ({}, {"Authorization": "Bearer other"}, {"Authorization": "Basic secret"}):
+            answer = requests.post(f"{url}/act", body, headers=headers, timeout=60)
+            assert (answer.status_code, answer.headers["WWW-Authenticate"]) == (401, "Bearer")
+        known = {"Authorization": "bearer secret"}
+        answer = requests.post(f"{url}/act", body, headers=known, timeout=60)
+        assert answer.status_code in (400, 413, 422)
+
+
+def test_a_client_without_the_token_is_answered_at_the_end_of_its_body() -> None:
+    """Before, Serve's limits of time and of waiting requests apply to it."""
+    with serving(token="secret") as url:
+        host, port = url.removeprefix("http://").split(":")
+        with socket.create_connection((host, int(port))) as client:
+            client.sendall(b"POST /act HTTP/1.1\r\nHost: x\r\nContent-Length: 2\r\n\r\n{")
+            client.settimeout(0.3)
+            with pytest.raises(TimeoutError):
+                client.recv(1)
+            client.settimeout(60)
+            client.sendall(b"{")
+            assert client.recv(65536).startswith(b"HTTP/1.1 401 ")
+
+
 def test_a_task_without_goals() -> None:
     facts = PolicyFacts(task="Pendulum", observation_size=3, goal_size=0, action_size=1)
     body = TypeAdapter(request_type(facts))

@@ -1079,6 +1079,12 @@ def test_slurm_writes_a_job_array_and_submits_it(
     first, second = Path("submitted").read_text().splitlines()
     assert first == "--parsable --array=1-8 smoke.slurm.sh"
     assert second == "--parsable --dependency=afterany:1 smoke.slurm.sh"
+    stub.write_text(
+        '#!/bin/sh\ncase "$*" in *--array*) echo 7;; *) echo too many jobs >&2; exit 1;; esac\n'
+    )
+    half = program(*command, "--submit")
+    assert (half.code, "too many jobs. Job 7 (8 tasks) is submitted" in half.errors) == (1, True)
+    assert "sbatch --dependency=afterany:7 smoke.slurm.sh" in half.errors
     stub.write_text("#!/bin/sh\necho no such partition >&2; exit 1\n")
     refused = program(*command, "--submit")
     assert (refused.code, "no such partition" in refused.errors) == (2, True)
