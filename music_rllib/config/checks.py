@@ -8,7 +8,7 @@ from typing import Any
 from music_rllib import names
 from music_rllib.config.layers import PlacedPoint, is_in
 from music_rllib.config.problems import ConfigError, Findings, KeyPath, shown, unknown
-from music_rllib.config.run_settings import RunSettings
+from music_rllib.config.run_settings import VARIANTS, RunSettings
 from music_rllib.config.schema import Analysis, Hypothesis, Point, Stage, same_value
 from music_rllib.config.search import SearchSettings, of_stage
 from music_rllib.config.space import Choice
@@ -20,6 +20,10 @@ _OF_SUCCESS = frozenset(
     {names.EVAL_SUCCESS, names.EVAL_SUCCESS_ANY, names.TRAIN_SUCCESS, names.TRAIN_SUCCESS_ANY}
 )
 """Metrics of tasks that declare success."""
+_OF_OBJECTS = frozenset(
+    {names.EVAL_DISPLACEMENT, names.EVAL_TOUCHED, names.TRAIN_DISPLACEMENT, names.TRAIN_TOUCHED}
+)
+"""Metrics of tasks with a split."""
 
 
 def check_search(
@@ -72,7 +76,7 @@ def _broken_metric(metric: str, stage: Stage) -> str | None:
         for key, value in vars(names).items()
         if isinstance(value, str)
         and value.partition("/")[0] in names.GROUPS
-        and value not in prefixes
+        and value not in (*prefixes, names.SYSTEM_SECONDS)  # which is not part of reports
         and not key.startswith(("ARTIFACT_", "SETTING_"))
     }
     of_dimension = any(
@@ -87,6 +91,14 @@ def _broken_metric(metric: str, stage: Stage) -> str | None:
             f"must be a metric that {', '.join(without)} has too, which declares no success: write "
             f"objective: {{metric: {names.EVAL_RETURN}}}, got {shown(metric)}"
         )
+    without = [task.name for task in stage.tasks if not task.has_split]
+    if metric in _OF_OBJECTS and without:
+        return (
+            f"must be a metric that {', '.join(without)} has too, which has no "
+            f"surrounding_indices, got {shown(metric)}"
+        )
+    if metric.startswith("mutual_information/") and not VARIANTS[stage.variant].uses_mi:
+        return f"must be a metric of {stage.variant}, which has no estimator, got {metric}"
     return None
 
 

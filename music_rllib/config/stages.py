@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import json
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -200,10 +201,13 @@ def _grid_points(grid: Mapping[str, list[Any]]) -> list[PlacedPoint]:
 
 
 def _forbid_equal_points(points: tuple[Point, ...], findings: Findings) -> None:
-    """Reject two points that are the same trial, such as two spellings of one schedule."""
+    """Reject two points that are the same trial.
+
+    Such as two spellings of one schedule, or two weights of an intrinsic reward that is not given.
+    """
     seen = set()
     for point in points:
-        runs = tuple(run.model_dump_json() for run in point.runs.values())
+        runs = tuple(json.dumps(run.identity()) for run in point.runs.values())
         if runs and runs in seen:
             findings.add(
                 ("grid",), f"must not have two equal points, got {shown(point.values)} again"

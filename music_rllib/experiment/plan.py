@@ -275,14 +275,27 @@ def remarks(plan: Plan) -> list[str]:
 
 
 def _shared_runs(plan: Plan) -> Iterator[str]:
-    """A line about each stage with runs whose settings are all equal to an earlier stage's."""
-    counts = Counter((run.stage, plan.node(run.key).stage) for run in plan.runs)
-    for (stage, first), count in counts.items():
-        if stage != first:
-            yield (
-                f"{stage}: {in_runs(count)} equal to runs of {first}: trained once, and counted "
-                f"for {first} only in reports, comparisons and hypotheses"
-            )
+    """A line about each stage or task with runs whose settings are all equal to another one's."""
+    counts = Counter(
+        (run.stage, run.task, first.stage, first.task)
+        for run in plan.runs
+        for first in [plan.node(run.key)]
+    )
+    stages: Counter[tuple[str, str]] = Counter()
+    for (stage, task, first_stage, first_task), count in counts.items():
+        if stage != first_stage:
+            stages[stage, first_stage] += count
+        elif task != first_task:
+            yield _shared_text(f"{stage} on {task}", count, f"{first_stage} on {first_task}")
+    for (stage, first), count in stages.items():
+        yield _shared_text(stage, count, first)
+
+
+def _shared_text(where: str, count: int, first: str) -> str:
+    return (
+        f"{where}: {in_runs(count)} equal to runs of {first}: trained once, and counted for "
+        f"{first} only in reports, comparisons and hypotheses"
+    )
 
 
 def _unbounded_alphas(plan: Plan) -> Iterator[str]:

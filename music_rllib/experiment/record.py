@@ -17,7 +17,7 @@ from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.schema import Stage, SweepConfig
 from music_rllib.errors import BadInputError, indented
 from music_rllib.experiment.open_sweep import FINISHED, OpenSweep, plan_node
-from music_rllib.experiment.plan import Node, budget_settings, make_plan
+from music_rllib.experiment.plan import Node, budget_settings, continuation_key, make_plan
 from music_rllib.experiment.sweep_files import (
     CONFIG,
     IN_STORAGE,
@@ -130,6 +130,24 @@ def _earlier_runs(sweep: OpenSweep) -> list[dict[str, Any]]:
     return [{name: one[name] for name in kept if name in one} for one in earlier]
 
 
+def results_of_other_budgets(sweep: OpenSweep) -> dict[str, int]:
+    """By continuation key: the time in ms of the first result of an earlier plan's runs.
+
+    These runs begin like those of the plan and differ in `env_steps`: a hypothesis that is newer
+    than their results is not planned.
+    """
+    own = {node.key for node in sweep.plan.nodes}
+    recorded = (*sweep.recorded.get("nodes", ()), *sweep.recorded.get("earlier", ()))
+    earlier = [one for one in recorded if one["key"] not in own and "continuation" in one]
+    times: dict[str, int] = {}
+    for key in sweep.store.finished(one["key"] for one in earlier) if earlier else ():
+        with contextlib.suppress(StorageError):  # the time of a damaged run is not known
+            time = sweep.store.history(key)[-1].timestamp_ms
+            continuation = next(one["continuation"] for one in earlier if one["key"] == key)
+            times[continuation] = min(times.get(continuation, time), time)
+    return times
+
+
 def earlier_text(location: SweepLocation) -> str | None:
     """A sentence about a sweep's runs of earlier versions; None if there are none."""
     recorded = (location.read(PLAN) or {}).get("earlier", ())
@@ -188,8 +206,7 @@ def changes_since(sweep: OpenSweep) -> Changes | None:
         old = recorded[node.label]
         lines = list(_changed_settings(runs[node.label], node.run)) if node.label in runs else []
         is_longer = (
-            len(lines) == 1
-            and old["input"] == node.source_key
+            old.get("continuation") == continuation_key(node.run, node.source_key)
             and old["env_steps"] < node.run.env_steps
         )
         continued = sweep.continued_from(node) if is_longer else None

@@ -26,6 +26,8 @@ from music_rllib.config.schema import Hypothesis, Stage, SweepConfig
 from music_rllib.config.tac_settings import setting_text
 from music_rllib.errors import reason_of
 from music_rllib.experiment.open_sweep import OpenSweep
+from music_rllib.experiment.plan import continuation_key
+from music_rllib.experiment.record import results_of_other_budgets
 from music_rllib.experiment.sweep_files import ANALYSIS_PLAN, SweepLocation, as_json
 from music_rllib.schedules import StrictModel
 from music_rllib.store.serialization import content_key
@@ -127,6 +129,16 @@ class AnalysisPlan(StrictModel, strict=True):
 
     def has_same_test(self, other: AnalysisPlan) -> bool:
         return (self.metric, self.margin) == (other.metric, other.margin)
+
+    def is_longer(self, other: AnalysisPlan) -> bool:
+        """Whether this is the same test over more steps of a task."""
+        more = (steps > other.budget.get(task, steps) for task, steps in self.budget.items())
+        return self.has_same_test(other) and any(more)
+
+    def asks_as(self, other: AnalysisPlan) -> bool:
+        """Whether the `analysis` section is the same; seeds and budgets may differ."""
+        asked = {"question", "hypotheses", "stage", "metric", "margin"}
+        return self.model_dump(include=asked) == other.model_dump(include=asked)
 
     def is_part_of(self, other: AnalysisPlan) -> bool:
         """Whether this is `other`, possibly for a subset of its seeds."""
@@ -314,8 +326,13 @@ def plans_in(storage: str, name: str) -> tuple[PlanVersion, ...]:
         ) from error
 
 
-def record_plan(sweep: OpenSweep) -> tuple[Sequence[PlanVersion], tuple[str, ...]]:
+def record_plan(
+    sweep: OpenSweep, *, only_questions: bool = False
+) -> tuple[Sequence[PlanVersion], tuple[str, ...]]:
     """Record the plan of a sweep's configuration as a new version if it changed.
+
+    With `only_questions`, a plan that asks what the last version asks is not recorded: `plan` can
+    show other seeds and budgets, which count when they are run.
 
     Returns:
         All versions; and the hypotheses of a new one about stages with a finished run, without
@@ -328,12 +345,20 @@ def record_plan(sweep: OpenSweep) -> tuple[Sequence[PlanVersion], tuple[str, ...
     plan = analysis_plan(sweep.config)
     if plan is None:
         return before, ()
+    if only_questions and before and plan.asks_as(before[-1].plan):
+        return before, ()
     versions = with_plan(before, plan, int(time.time() * 1000))
     if len(versions) == len(before):
         return versions, ()
     sweep.location.keep(ANALYSIS_PLAN, as_json(as_document(versions)))
     sweep.location.keep(PLANS_TO_READ, as_markdown(sweep.config.name, versions))
-    done = {node.stage for node in sweep.plan.nodes if node.key in sweep.finished}
+    shown = results_of_other_budgets(sweep)
+    done = {
+        node.stage
+        for node in sweep.plan.nodes
+        if node.key in sweep.finished
+        or (shown and continuation_key(node.run, node.source_key) in shown)
+    }
     known = [one.plan for one in before if plan.has_same_test(one.plan)]
     return versions, tuple(
         hypothesis.text

@@ -23,8 +23,8 @@ from music_rllib.envs.fingerprint import digest_of
 from music_rllib.errors import reason_of
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.open_sweep import OpenSweep, open_started
-from music_rllib.experiment.plan import Node
-from music_rllib.experiment.record import earlier_text
+from music_rllib.experiment.plan import Node, continuation_key
+from music_rllib.experiment.record import earlier_text, results_of_other_budgets
 from music_rllib.experiment.run_info import run_info
 from music_rllib.experiment.sweep_files import SweepLocation, find_sweep
 from music_rllib.redaction import redact
@@ -185,9 +185,12 @@ def _reader(
     store, begun = opened.store, opened.store.begun()
     damaged, causes = store.damage(opened.damaged), _causes(opened, state)
     is_alive, pruned = sweep_files.is_alive(state), state.get("pruned", ())
+    shown = results_of_other_budgets(opened)
 
     def read(node: Node) -> _Run:
         run = planned_run(node, opened.plan.algorithm)
+        if shown and (time := shown.get(continuation_key(node.run, node.source_key))):
+            run = replace(run, tags={**run.tags, names.TAG_EARLIER_RESULT: str(time)})
         try:
             if node.key in damaged:
                 raise damaged[node.key]

@@ -212,7 +212,7 @@ def first_result(sweep: Sweep, runs: Iterable[int]) -> float:
     """Time of the earliest last evaluation of a finished run, in ms since the epoch.
 
     It is infinite before any run has finished. A run that another sweep trained counts at the time
-    of its training.
+    of its training. So does a run of an earlier plan with other `env_steps`.
     """
     ends = []
     for run in runs:
@@ -220,6 +220,8 @@ def first_result(sweep: Sweep, runs: Iterable[int]) -> float:
         times = sweep.column(run, sweep.primary_metric(record.task)).time
         if record.is_finished and len(times):
             ends.append(float(times[-1]))
+        with suppress(ValueError):
+            ends.append(float(record.tags.get(names.TAG_EARLIER_RESULT, "")))
     return min(ends, default=np.inf)
 
 

@@ -17,8 +17,9 @@ import numpy as np
 
 from music_rllib import names
 from music_rllib.config.schema import Hypothesis, same_value
+from music_rllib.experiment.plan import Plan
 from music_rllib.results import statistics as st
-from music_rllib.results.analysis_plan import PlannedHypothesis, PlanVersion
+from music_rllib.results.analysis_plan import AnalysisPlan, PlannedHypothesis, PlanVersion
 from music_rllib.results.claims import Claim, Pairs, claims_of, decided, exploratory
 from music_rllib.results.conditions import (
     ALPHA,
@@ -31,7 +32,7 @@ from music_rllib.results.conditions import (
     stages_together,
     whole_setting,
 )
-from music_rllib.results.data import RunRecord, Sweep
+from music_rllib.results.data import LastValues, RunRecord, Sweep
 from music_rllib.results.scores import Measure, Scores, counted, first_result, measure_on, scores_of
 from music_rllib.results.statistics import Estimate
 
@@ -138,6 +139,12 @@ def study_of(
         of_late = _of_plan(sweep, stages, latest, late, untested)
         unplanned += [replace(claim, why=why) for claim in of_late]
         unplanned += _of_plan(sweep, stages, latest, again, untested)
+        longer = [
+            one for one in now if one in in_time and latest.plan.is_longer(in_time[one].plan)
+        ]
+        why = "exploratory: over more steps than planned"
+        of_longer = _of_plan(sweep, stages, latest, longer, untested)
+        unplanned += [replace(claim, why=why) for claim in of_longer]
     means: list[Mean] = []
     if chosen is not None:
         kind, margin = "auc", None
@@ -251,6 +258,29 @@ def _of_plan(
             reason = "no seed has finished in both conditions"
             untested[f"{hypothesis.text}{where if claims else ''}: {reason}"] = scopes - len(claims)
         yield from (replace(claim, hypothesis=hypothesis) for claim in claims)
+
+
+def untestable(planned: Plan, plan: AnalysisPlan) -> Iterator[str]:
+    """The hypotheses that no results of the planned runs can test, with the reason.
+
+    Those about a search are left out: its runs on fresh seeds are not known yet.
+    """
+    sweep = LastValues(planned).sweep({})
+    stages = {found.name: found for found in find_stages(sweep)}
+    searched = {stage.name for stage in planned.searched}
+    for key in plan.planned:
+        if key.stages & searched:
+            continue
+        hypothesis = Hypothesis.of(key.text)
+        sides = [_matching(sweep, stages, side, plan.stage) for side in hypothesis.sides]
+        for side, settings in zip(sides, hypothesis.sides, strict=True):
+            if not side:
+                yield f"{key.text}: no condition of its own has {_in_words(settings)}"
+                break
+        else:
+            pairs = _equal_in_the_rest(*sides, hypothesis)
+            if isinstance(pairs, str):
+                yield f"{key.text}: {pairs}"
 
 
 def _in_full(text: str, version: PlanVersion, latest: PlanVersion | None) -> Hypothesis:

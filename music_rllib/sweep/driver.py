@@ -96,7 +96,7 @@ def plan(config: SweepConfig, *, measure: bool = False, as_json: bool = False) -
             _say(console, changes, "yellow")
         document = plan_answer(opened, changes)
         document["cluster"] = None if cluster is None else cluster_answer(opened, cluster)
-        document["analysis_plan"] = _record_analysis_plan(console, opened)
+        document["analysis_plan"] = _record_analysis_plan(console, opened, only_questions=True)
         if measure:
             document["cost"] = _measure(console, opened)
         console.print("The configuration is valid. Nothing was started.")
@@ -260,13 +260,15 @@ def _check(opened: OpenSweep) -> None:
         check_reachable(address)
 
 
-def _record_analysis_plan(console: Console, opened: OpenSweep) -> list[dict[str, Any]]:
+def _record_analysis_plan(
+    console: Console, opened: OpenSweep, *, only_questions: bool = False
+) -> list[dict[str, Any]]:
     """Keep the analysis plan before anything is trained; all of its versions as plain data."""
     if opened.config.analysis is None and opened.location.read(ANALYSIS_PLAN) is None:
         return []
     from music_rllib.results.analysis_plan import PLANS_TO_READ, as_document, record_plan
 
-    versions, late = record_plan(opened)
+    versions, late = record_plan(opened, only_questions=only_questions)
     if versions:
         last = versions[-1]
         place = redact(f"{opened.storage}/{opened.config.name}/{PLANS_TO_READ}")
@@ -278,6 +280,11 @@ def _record_analysis_plan(console: Console, opened: OpenSweep) -> list[dict[str,
             f"Not planned by this version, because runs of it have finished: {'; '.join(late)}",
             "yellow",
         )
+    if opened.config.analysis is not None:
+        from music_rllib.results.study import untestable
+
+        for text in untestable(opened.plan, versions[-1].plan):
+            _say(console, f"No result can test {text}", "yellow")
     return as_document(versions)
 
 

@@ -206,6 +206,8 @@ class StateFile(Listener):
             if VARIANTS[stage.variant].fixed["task_reward"]
             and (stage.search is not None or trials[stage.name] > 1)
         ]
+        chosen = sweep.config.stage().name  # the stage of `best` comes first, then the last one
+        compared.sort(key=lambda stage: stage.name == chosen)
         now, to_come = self._last_values.sweep(self._results), self._to_come(searches)
         self._state = {
             "sweep": sweep.config.name,

@@ -1,0 +1,191 @@
+"""From a sweep file to its answer: what is planned, refused, recorded and compared."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from music_rllib import names
+from music_rllib.config.problems import ConfigError
+from music_rllib.experiment.open_sweep import OpenSweep, continued_runs_text, open_sweep
+from music_rllib.experiment.plan import continuation_key, make_plan, remarks
+from music_rllib.experiment.record import changes_since, keep_record
+from music_rllib.program import main
+from music_rllib.results.analysis_plan import analysis_plan, plans_in, record_plan
+from music_rllib.results.read import read_sweep
+from music_rllib.results.study import study_of, untestable
+from music_rllib.store.history import Report
+from music_rllib.sweep.listeners.state_file import StateFile
+from tests.played_search import publish
+from tests.sweep_files import loaded
+
+
+def document(stages: list[dict[str, Any]] | None = None, **changes: Any) -> dict[str, Any]:
+    grid = {"tac.entropic_index": [1.0, 2.0]}
+    return {
+        "name": "s",
+        "tasks": ["FetchPush"],
+        "seeds": 5,
+        "defaults": {"env_steps": 2000, "evaluation": {"interval": 500, "episodes": 20}},
+        "stages": stages or [{"name": "her", "variant": "tac", "grid": grid}],
+    } | changes
+
+
+def opened(folder: Path, content: dict[str, Any]) -> OpenSweep:
+    config = loaded(folder, content, storage=str(folder / "results"))
+    sweep = open_sweep(config, make_plan(config), config.storage)
+    keep_record(sweep)
+    return sweep
+
+
+def play(sweep: OpenSweep, at_ms: int, before: int = 0) -> None:
+    """As if all runs had been trained; those that continue have the reports of `before` ms, too."""
+    with StateFile(sweep) as state_file:
+        for node in sweep.plan.nodes:
+            q = float(node.run.tac.entropic_index)  # type: ignore[arg-type]
+            history = [
+                Report(
+                    env_steps=at,
+                    seconds=at / 1e6,
+                    timestamp_ms=before if before and at <= 2000 else at_ms,
+                    metrics={
+                        names.EVAL_SUCCESS: at / 4000 * (1 - 0.2 * q) + 0.01 * node.seed,
+                        names.EVAL_EPISODES: 20.0,
+                    },
+                )
+                for at in range(500, node.run.env_steps + 1, 500)
+            ]
+            result = publish(sweep, node, history)
+            last = sweep.store.continuation(continuation_key(node.run, node.source_key))
+            with last.new_checkpoint(node.run.env_steps):
+                pass
+            sweep.scheduler.start(node.key)
+            sweep.scheduler.finish(node.key)
+            state_file.finished(node, result)
+        state_file.end("finished")
+
+
+def test_a_hypothesis_about_runs_that_continue_shown_ones_is_late(tmp_path: Path) -> None:
+    now = int(time.time() * 1000)
+    play(opened(tmp_path, document()), now - 5000)
+    analysis = {"hypotheses": ["q = 2 worse than q = 1"]}
+    longer = document(analysis=analysis)
+    longer["defaults"]["env_steps"] = 4000
+    sweep = opened(tmp_path, longer)
+    assert record_plan(sweep)[1] == ("q = 2 worse than q = 1",)
+    play(sweep, now + 60_000, before=now - 5000)
+    study = study_of(read_sweep(str(tmp_path / "results/s")).sweep)
+    assert (study.planned, study.late) == ((), ("q = 2 worse than q = 1",))
+
+
+def test_plan_names_hypotheses_that_no_result_can_test(tmp_path: Path) -> None:
+    grid = {"tac.entropic_index": [1.0, 1.5], "tac.alpha": [0.05, 0.1]}
+    texts = ["q = 1.5 against q = 1", "q = 1.5, alpha = 0.1 against q = 1"]
+    stage = {"name": "her", "variant": "tac", "grid": grid}
+    config = loaded(tmp_path, document([stage], analysis={"hypotheses": texts}))
+    plan = analysis_plan(config)
+    assert plan is not None
+    (found,) = untestable(make_plan(config), plan)
+    assert found.startswith(texts[1])
+    assert "must name more settings" in found
+
+
+def test_plan_with_other_seeds_or_steps_is_no_new_analysis_plan(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    asked = {"hypotheses": ["q = 2 against q = 1"]}
+    sweep = opened(tmp_path, document(analysis=asked))
+    record_plan(sweep)
+    Path("sweep.yaml").write_text(yaml.safe_dump(document(analysis=asked)))
+    for changes in (["--seeds", "12"], ["env_steps=1e6"]):
+        assert main(["plan", "sweep.yaml", *changes]) == 0
+        assert len(plans_in(sweep.storage, "s")) == 1
+    assert main(["plan", "sweep.yaml", "analysis.margin=0.1"]) == 0
+    assert len(plans_in(sweep.storage, "s")) == 2
+
+
+def test_points_that_differ_in_settings_of_a_missing_reward_are_equal(tmp_path: Path) -> None:
+    stage = {"name": "t", "variant": "tac", "grid": {"intrinsic.weight": [0.1, 0.5]}}
+    with pytest.raises(ConfigError, match="must not have two equal points"):
+        loaded(tmp_path, document([stage]))
+    stage["grid"] = {"intrinsic": [{"reward": "rnd", "weight": w} for w in (0.1, 0.5)]}
+    assert len(make_plan(loaded(tmp_path, document([stage]))).nodes) == 10
+
+
+def test_a_task_whose_runs_are_those_of_another_task_is_named(tmp_path: Path) -> None:
+    again = {"env_id": "FetchSlide-v4", "horizon": 50, "mi_reward_weight": 1.0}
+    split = {"agent_indices": "0:3", "surrounding_indices": "3:6"}
+    content = document(tasks=["FetchSlide", "Slide1"], environments={"Slide1": again | split})
+    (line,) = remarks(make_plan(loaded(tmp_path, content)))
+    assert line.startswith("her on Slide1: 10 runs equal to runs of her on FetchSlide: ")
+
+
+def test_a_longer_run_continues_beside_a_setting_that_changes_no_result(tmp_path: Path) -> None:
+    mine = {"env_id": "Pendulum-v1", "horizon": 100, "success_key": None}
+    stage = {"name": "train", "variant": "tac"}
+    content = document([stage], tasks=["Mine"], seeds=[0], environments={"Mine": mine})
+    play(opened(tmp_path, content), 1)
+    mine["reward_range"] = [-20.0, 0.0]
+    content["defaults"]["env_steps"] = 4000
+    config = loaded(tmp_path, content, storage=str(tmp_path / "results"))
+    sweep = open_sweep(config, make_plan(config), config.storage)
+    assert continued_runs_text(sweep)
+    assert changes_since(sweep) is None
+
+
+def test_status_and_best_choose_the_same_stage(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    grid = {"tac.entropic_index": [1.0, 2.0]}
+    stages = [{"name": name, "variant": "tac", "grid": grid} for name in ("first", "last")]
+    stages[1]["tac"] = {"lr": 0.002}
+    analysis = {"hypotheses": ["q = 2 against q = 1"], "stage": "first"}
+    play(opened(tmp_path, document(stages, analysis=analysis)), 1)
+    found = []
+    for command in ("status", "best"):
+        assert main([command, str(tmp_path / "results/s"), "--json"]) == 0
+        answer = json.loads(capsys.readouterr().out)
+        found.append((answer["best"] if command == "status" else answer)["stage"])
+    assert found == ["first", "first"]
+
+
+@pytest.mark.parametrize(
+    ("task", "metric"),
+    [
+        ("FetchReach", "evaluation/object_displacement"),
+        ("FetchPush", "mutual_information/bound"),
+        ("FetchPush", "system/training_seconds"),
+    ],
+)
+def test_an_objective_that_no_run_reports_is_refused(
+    tmp_path: Path, task: str, metric: str
+) -> None:
+    space = {"tac.alpha": {"float": [0.1, 0.2]}}
+    search = {"space": space, "trials": 3, "objective": {"metric": metric}}
+    stage = {"name": "t", "variant": "tac", "search": search}
+    with pytest.raises(ConfigError, match="objective.metric must be a metric "):
+        loaded(tmp_path, document([stage], tasks=[task]))
+
+
+def test_more_steps_after_a_result_are_an_exploratory_comparison(tmp_path: Path) -> None:
+    """The planned one stays that over the planned steps."""
+    analysis = {"hypotheses": ["q = 2 worse than q = 1"]}
+    first = opened(tmp_path, document(analysis=analysis))
+    ((version,), _) = record_plan(first)
+    play(first, version.recorded_ms + 1)
+    longer = document(analysis=analysis)
+    longer["defaults"]["env_steps"] = 4000
+    sweep = opened(tmp_path, longer)
+    record_plan(sweep)
+    play(sweep, version.recorded_ms + 60_000, before=version.recorded_ms + 1)
+    study = study_of(read_sweep(str(tmp_path / "results/s")).sweep)
+    (planned,), (unplanned,) = study.planned, study.unplanned
+    assert planned.measure.words == "mean success over 2,000 steps"
+    assert unplanned.measure.words == "mean success over 4,000 steps"
+    assert unplanned.why == "exploratory: over more steps than planned"
