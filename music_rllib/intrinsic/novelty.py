@@ -145,11 +145,13 @@ class E3B(_InverseModel):
 
     @torch.no_grad()
     def of_episode(self, observations: Tensor, actions: Tensor) -> Tensor:
-        encoded = self.encode(observations).cpu()  # a GPU's sums differ from run to run
+        # On the CPU: a GPU's sums differ from run to run. In float64: in float32, rounding hides a
+        # small ridge behind the sums of a long episode, and bonuses become negative.
+        encoded = self.encode(observations).cpu().double()
         outer = torch.einsum("ni,nj->nij", encoded, encoded).cumsum(0)[:-1]
-        matrices = outer + self.ridge * torch.eye(encoded.shape[1])
+        matrices = outer + self.ridge * torch.eye(encoded.shape[1], dtype=encoded.dtype)
         solved: Tensor = torch.linalg.solve(matrices, encoded[1:])
-        return (encoded[1:] * solved).sum(-1)
+        return (encoded[1:] * solved).sum(-1).float()
 
     def bonus(self, batch: Batch) -> Tensor:
         assert batch.stored is not None

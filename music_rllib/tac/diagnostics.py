@@ -65,7 +65,10 @@ def of_updates(
     target = observed["targets"]
     metrics = {names.Q_MEAN: observed["q_values"].mean((1, 2))}
     if settings.target_bounds is not None:
-        metrics[names.CLIPPED_TARGETS] = _share_at_bounds(target, settings.target_bounds)
+        low, high = settings.target_bounds
+        # The mean of equal atoms may round to a number beside them.
+        rounding = 1e-5 * max(abs(low), abs(high)) if settings.quantiles else 0.0
+        metrics[names.CLIPPED_TARGETS] = _share_at_bounds(target, (low + rounding, high - rounding))
     if "log_density" in observed:
         metrics |= _of_policy(observed["log_density"], q, settings.entropy_form)
         log_std, bounds = observed["log_std"], settings.log_std_bounds

@@ -12,7 +12,9 @@ from ray.rllib.core import DEFAULT_MODULE_ID
 from torch import Tensor
 
 from music_rllib import names
+from music_rllib.config.tac_settings import TACSettings
 from music_rllib.functional.distribution import sample_squashed
+from music_rllib.kernels.actor_critic import mean_values
 from music_rllib.replay.trajectories import Trajectory
 from music_rllib.tac.algorithm import TACConfig
 from music_rllib.tac.diagnostics import NonFiniteLossError, of_updates
@@ -199,6 +201,17 @@ def test_metrics_stay_finite_where_the_losses_do() -> None:
     assert float(metrics[names.CLIPPED_DENSITIES]) == 1.0
     for name, value in (metrics | built._losses).items():
         assert torch.isfinite(value), name
+
+
+@pytest.mark.parametrize(("low", "high"), [(-50.0, 50.0), (-4 / 0.03, 4 / 0.03), (-16.7, 0.0)])
+def test_a_target_whose_atoms_are_all_at_a_bound_counts_as_clipped(low: float, high: float) -> None:
+    settings = TACSettings(
+        bootstrap="critics", critics=5, quantiles=25, dropped_quantiles=2, target_bounds=(low, high)
+    )
+    atoms = np.full((8, 5 * 23), low, np.float32)
+    targets = torch.from_numpy(mean_values(atoms[None]))
+    observed = {"q_values": torch.zeros(1, 5, 8), "targets": targets}
+    assert float(of_updates(observed, settings, 1.0)[names.CLIPPED_TARGETS]) == 1.0
 
 
 def test_a_loss_that_is_not_finite_stops_the_run_and_names_network_and_update() -> None:

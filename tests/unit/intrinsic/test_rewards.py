@@ -128,6 +128,22 @@ def test_e3b_equals_its_closed_form() -> None:
     assert float(twice[9:].mean()) < 0.6 * float(twice[:8].mean())
 
 
+def test_e3b_keeps_a_small_ridge_in_a_long_episode_at_rest() -> None:
+    torch.manual_seed(0)
+    e3b = E3B(Sizes(17, 0, 6), ridge=0.001)
+    with torch.no_grad():  # features as large as those of a trained encoder
+        e3b.encoder[-1].weight *= 8.0
+        e3b.encoder[-1].bias *= 8.0
+    frames = torch.randn(17) + 1e-4 * torch.randn(1001, 17)
+    frames[980:] += torch.linspace(0, 1, 21)[:, None] * torch.randn(17)
+    found = e3b.of_episode(frames, torch.zeros(1000, 6)).double()
+    features = e3b.encode(frames).detach().double()
+    matrices = torch.einsum("ni,nj->nij", features, features).cumsum(0)[:-1]
+    matrices += 0.001 * torch.eye(16).double()
+    expected = (features[1:] * torch.linalg.solve(matrices, features[1:])).sum(-1)
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=0.0)
+
+
 def test_diayn_separates_two_trivial_skills() -> None:
     diayn = made("diayn", skills=2)
     generator = torch.Generator().manual_seed(0)
