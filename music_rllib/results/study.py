@@ -139,9 +139,7 @@ def study_of(
         of_late = _of_plan(sweep, stages, latest, late, untested)
         unplanned += [replace(claim, why=why) for claim in of_late]
         unplanned += _of_plan(sweep, stages, latest, again, untested)
-        longer = [
-            one for one in now if one in in_time and latest.plan.is_longer(in_time[one].plan)
-        ]
+        longer = [one for one in now if one in in_time and latest.plan.is_longer(in_time[one].plan)]
         why = "exploratory: over more steps than planned"
         of_longer = _of_plan(sweep, stages, latest, longer, untested)
         unplanned += [replace(claim, why=why) for claim in of_longer]

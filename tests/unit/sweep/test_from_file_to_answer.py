@@ -169,7 +169,7 @@ def test_an_objective_that_no_run_reports_is_refused(
     space = {"tac.alpha": {"float": [0.1, 0.2]}}
     search = {"space": space, "trials": 3, "objective": {"metric": metric}}
     stage = {"name": "t", "variant": "tac", "search": search}
-    with pytest.raises(ConfigError, match="objective.metric must be a metric "):
+    with pytest.raises(ConfigError, match=r"objective\.metric must be a metric "):
         loaded(tmp_path, document([stage], tasks=[task]))
 
 
