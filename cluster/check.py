@@ -485,7 +485,7 @@ def check_kustomization(document: dict[str, Any], path: Path, crds: Crds | None 
 
 def _objects(resources: Any, folder: Path) -> list[dict[str, Any]]:
     """The objects of a kustomization's resources, also of other kustomizations."""
-    objects = []
+    objects: list[Any] = []
     for target in (folder / str(one) for one in resources):
         if target.is_file():
             objects += yaml.safe_load_all(target.read_text(encoding="utf-8"))

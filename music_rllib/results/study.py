@@ -270,13 +270,13 @@ def untestable(planned: Plan, plan: AnalysisPlan) -> Iterator[str]:
         if key.stages & searched:
             continue
         hypothesis = Hypothesis.of(key.text)
-        sides = [_matching(sweep, stages, side, plan.stage) for side in hypothesis.sides]
-        for side, settings in zip(sides, hypothesis.sides, strict=True):
+        first, second = (_matching(sweep, stages, side, plan.stage) for side in hypothesis.sides)
+        for side, settings in zip((first, second), hypothesis.sides, strict=True):
             if not side:
                 yield f"{key.text}: no condition of its own has {_in_words(settings)}"
                 break
         else:
-            pairs = _equal_in_the_rest(*sides, hypothesis)
+            pairs = _equal_in_the_rest(first, second, hypothesis)
             if isinstance(pairs, str):
                 yield f"{key.text}: {pairs}"
 

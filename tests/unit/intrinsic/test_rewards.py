@@ -132,8 +132,8 @@ def test_e3b_keeps_a_small_ridge_in_a_long_episode_at_rest() -> None:
     torch.manual_seed(0)
     e3b = E3B(Sizes(17, 0, 6), ridge=0.001)
     with torch.no_grad():  # features as large as those of a trained encoder
-        e3b.encoder[-1].weight *= 8.0
-        e3b.encoder[-1].bias *= 8.0
+        for parameter in e3b.encoder[-1].parameters():
+            parameter.mul_(8.0)
     frames = torch.randn(17) + 1e-4 * torch.randn(1001, 17)
     frames[980:] += torch.linspace(0, 1, 21)[:, None] * torch.randn(17)
     found = e3b.of_episode(frames, torch.zeros(1000, 6)).double()

@@ -127,7 +127,7 @@ def test_a_task_whose_runs_are_those_of_another_task_is_named(tmp_path: Path) ->
 
 
 def test_a_longer_run_continues_beside_a_setting_that_changes_no_result(tmp_path: Path) -> None:
-    mine = {"env_id": "Pendulum-v1", "horizon": 100, "success_key": None}
+    mine: dict[str, Any] = {"env_id": "Pendulum-v1", "horizon": 100, "success_key": None}
     stage = {"name": "train", "variant": "tac"}
     content = document([stage], tasks=["Mine"], seeds=[0], environments={"Mine": mine})
     play(opened(tmp_path, content), 1)
@@ -143,8 +143,8 @@ def test_status_and_best_choose_the_same_stage(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     grid = {"tac.entropic_index": [1.0, 2.0]}
-    stages = [{"name": name, "variant": "tac", "grid": grid} for name in ("first", "last")]
-    stages[1]["tac"] = {"lr": 0.002}
+    first: dict[str, Any] = {"name": "first", "variant": "tac", "grid": grid}
+    stages = [first, first | {"name": "last", "tac": {"lr": 0.002}}]
     analysis = {"hypotheses": ["q = 2 against q = 1"], "stage": "first"}
     play(opened(tmp_path, document(stages, analysis=analysis)), 1)
     found = []
