@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import gc
 import inspect
 import os
@@ -34,6 +35,7 @@ for _name in ("FORCE_COLOR", "RAY_ADDRESS", "MLFLOW_TRACKING_URI", "MLFLOW_RUN_I
 
 import hypothesis
 import pytest
+import typer.main
 
 from music_rllib.runtime.quiet import (
     LOCAL_RAY_BEYOND_LOOPBACK,
@@ -58,6 +60,9 @@ def _stack(context: int = 0) -> list[inspect.FrameInfo]:
 # RLlib's connectors find their caller with `inspect.stack()`, which looks for the source of each
 # of pytest's frames: 0.25 s for every Learner.
 inspect.stack = _stack
+
+# Each call of `main` would make all commands again: 15 ms, of which a test has up to forty.
+typer.main.get_command = functools.cache(typer.main.get_command)
 
 # Imports and collection create millions of permanent objects, and a fifth of a worker's start was
 # spent on garbage collection among them. `pytest_collection_finish` enables it again.

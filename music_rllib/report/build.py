@@ -156,9 +156,7 @@ def limitations(
     In a `live` sweep no run is missing yet.
     """
     sentences = [] if live else [*_missing(sweep)]
-    tags = ((run, run.tags.get(names.TAG_ENVIRONMENT, "")) for run in sweep.runs)
-    sentences += mixed((run.task, run.name, digest) for run, digest in tags if run.is_finished)
-    return [*sentences, *_missing_results(sweep, analyses), *_diverged(sweep)]
+    return [*sentences, *mixed(sweep.runs), *_missing_results(sweep, analyses), *_diverged(sweep)]
 
 
 def _missing(sweep: Sweep) -> Iterator[str]:

@@ -93,18 +93,9 @@ def _median_runs(
     tasks = stage.tasks if len(qs) * len(stage.tasks) <= MOST else stage.tasks[:1]
     for task in tasks:
         for q in qs:
-            rated = [
-                (rate, run)
-                for condition in conditions
-                if condition.entropic_index == q
-                for run in condition.runs
-                if sweep.runs[run].task == task
-                and sweep.runs[run].is_finished
-                and (rate := sweep.final(run, sweep.primary_metric(task))) is not None
-            ]
-            if rated:
-                _, median = sorted(rated)[len(rated) // 2]
-                yield q or sweep.runs[median].entropic_index, sweep.runs[median]
+            runs = [run for one in conditions if one.entropic_index == q for run in one.runs]
+            if (median := sweep.median_run(runs, task, sweep.primary_metric(task))) is not None:
+                yield q or median.entropic_index, median
 
 
 def _record(storage: str, run: RunRecord, q: str, environments: Sequence[Task]) -> Video:

@@ -8,7 +8,7 @@ evaluations of every run; a run that failed or is still running is censored at i
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -24,7 +24,7 @@ from music_rllib.results.conditions import (
     StageRuns,
     find_stages,
 )
-from music_rllib.results.data import Ints, Sweep
+from music_rllib.results.data import Ints, RunRecord, Sweep
 from music_rllib.results.statistics import Array, Estimate
 
 THRESHOLDS = (0.5, 0.85)
@@ -274,16 +274,12 @@ _SHOWN = 10
 """Largest number of runs in a sentence."""
 
 
-def mixed(runs: Iterable[tuple[str, str, str]]) -> Iterator[str]:
-    """A line for each task whose runs used several versions of its environment.
-
-    Args:
-        runs: Task, label and environment's digest of each run; "" if that was not recorded.
-    """
+def mixed(runs: Iterable[RunRecord], label: Callable[[str], str] = str) -> Iterator[str]:
+    """A line for each task whose finished runs used several versions of its environment."""
     tasks: dict[str, dict[str, list[str]]] = {}
-    for task, label, digest in runs:
-        if digest:
-            tasks.setdefault(task, {}).setdefault(digest, []).append(label)
+    for run in runs:
+        if run.is_finished and (digest := run.tags.get(names.TAG_ENVIRONMENT)):
+            tasks.setdefault(run.task, {}).setdefault(digest, []).append(label(run.name))
     for task, groups in tasks.items():
         if len(groups) > 1:
             parts = (

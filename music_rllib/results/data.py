@@ -217,6 +217,17 @@ class Sweep:
         values = self.column(run, metric).value
         return float(values[-1]) if len(values) and np.isfinite(values[-1]) else None
 
+    def median_run(self, runs: Iterable[int], task: str, metric: str) -> RunRecord | None:
+        """The run on a task with the median score, which no luck explains; None if none is done."""
+        scores = [
+            (score, int(run.seed), position)
+            for position in runs
+            for run in [self.runs[position]]
+            if run.task == task and run.is_finished
+            if (score := self.final(position, metric)) is not None
+        ]
+        return self.runs[sorted(scores)[len(scores) // 2][2]] if scores else None
+
     def early(self, run: int, metric: str) -> float | None:
         """Mean of a metric of `runs[run]` over the first quarter of its steps; None without one.
 

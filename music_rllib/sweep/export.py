@@ -22,7 +22,7 @@ from music_rllib.experiment.open_sweep import OpenSweep, open_started
 from music_rllib.experiment.plan import Node, Plan
 from music_rllib.experiment.sweep_files import SweepLocation
 from music_rllib.redaction import redact
-from music_rllib.results.data import LastValues, RunRecord, Sweep
+from music_rllib.results.data import LastValues, Sweep
 from music_rllib.results.read import searches_of
 from music_rllib.search.best import best_so_far, best_text, condition_of, ranking_metric
 from music_rllib.store.files import write_atomically
@@ -119,7 +119,7 @@ def _export_condition(
     tasks = list(dict.fromkeys(sweep.runs[run].task for run in runs))
     tasks = [best["task"]] if "task" in best else tasks
     for task in tasks:
-        run = _median_run(sweep, runs, task, metric)
+        run = sweep.median_run(runs, task, metric)
         if run is None:
             continue
         folder = output if len(tasks) == 1 else output / task
@@ -146,16 +146,6 @@ def _runs_of(
     own = (run for run in plan.runs if (run.stage, run.part) == (stage.name, part))
     keys = {run.key for run in own if dict(run.values) == best["values"]}
     return [position for position, run in enumerate(sweep.runs) if run.node_key in keys]
-
-
-def _median_run(sweep: Sweep, runs: Sequence[int], task: str, metric: str) -> RunRecord | None:
-    """The run with the median score on a task; None if none is finished."""
-    scores = [
-        (score, int(sweep.runs[run].seed), run)
-        for run in runs
-        if sweep.runs[run].task == task and (score := sweep.final(run, metric)) is not None
-    ]
-    return sweep.runs[sorted(scores)[len(scores) // 2][2]] if scores else None
 
 
 def _export(opened: OpenSweep, key: str, folder: Path, chosen: Mapping[str, Any]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import runpy
 import shlex
 import subprocess
 import sys
@@ -282,12 +283,23 @@ def test_the_schema_accepts_shipped_sweeps_and_rejects_unknown_names(
     assert all("description" in field for field in described.values())
 
 
-@pytest.mark.parametrize(
-    "program", ["music_rllib plan", "music_rllib.sweep", "music_rllib.sweep --name other"]
-)
-def test_it_runs_as_a_module_from_any_folder(program: str, tmp_path: Path) -> None:
+WRONG = "error: command line: tac.alpha must be >= 0, got -1\n"
+
+
+def test_it_runs_as_a_module_from_any_folder(tmp_path: Path) -> None:
     environment = os.environ | {"PYTHONPATH": str(REPOSITORY)}
-    done = fresh("-m", *program.split(), "tac.alpha=-1", code=2, cwd=tmp_path, env=environment)
-    assert done.stdout == ""
-    assert done.stderr == "error: command line: tac.alpha must be >= 0, got -1\n"
+    module = ("-m", "music_rllib.sweep", "tac.alpha=-1")
+    done = fresh(*module, code=2, cwd=tmp_path, env=environment)
+    assert (done.stdout, done.stderr) == ("", WRONG)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("program", ["music_rllib plan", "music_rllib.sweep --name other"])
+def test_a_module_takes_the_arguments_of_the_program(
+    program: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    module, *arguments = program.split()
+    monkeypatch.setattr(sys, "argv", [module, *arguments, "tac.alpha=-1"])
+    with pytest.raises(SystemExit, match="2"):
+        runpy.run_module(module, run_name="__main__")
+    assert capsys.readouterr() == ("", WRONG)

@@ -129,16 +129,17 @@ def compared(x: pd.Series, y: pd.Series) -> Claim:
     assert list(x.index) == list(y.index)
     gap = (x - y).to_numpy()
     mean, error, freedom = gap.mean(), stats.sem(gap), len(gap) - 1
-    beyond = stats.ttest_1samp(gap, -MARGIN, alternative="greater").pvalue
-    within = stats.ttest_1samp(gap, MARGIN, alternative="less").pvalue
+    distances = np.array([abs(mean), mean + MARGIN, MARGIN - mean])
+    none, beyond, within = stats.t.sf(distances / error, freedom)  # each call takes a millisecond
+    half, narrow = stats.t.ppf([0.975, 0.95], freedom) * error
     away = np.abs(gap - np.median(gap))
     far = np.sum(away > max(5 * 1.4826 * np.median(away), MARGIN)) if len(gap) >= 16 else 0
     return {
         "difference": mean,
-        "p": stats.ttest_1samp(gap, 0).pvalue,
+        "p": 2 * none,
         "tost": max(beyond, within),
-        "95": stats.t.interval(0.95, freedom, mean, error),
-        "90": stats.t.interval(0.90, freedom, mean, error),
+        "95": (mean - half, mean + half),
+        "90": (mean - narrow, mean + narrow),
         "seeds": len(gap),
         "collapses": stats.beta.ppf(0.8, far + 1, len(gap) - far),
     }

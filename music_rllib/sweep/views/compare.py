@@ -13,7 +13,6 @@ from music_rllib.experiment.sweep_files import SweepLocation
 from music_rllib.names import ShortLabels
 from music_rllib.results.analysis import analyse_stage, mixed
 from music_rllib.results.answer import answer, study_data
-from music_rllib.results.data import Sweep
 from music_rllib.results.read import SweepRead, read_stored
 from music_rllib.results.study import study_of
 from music_rllib.results.tables import performance_tables, study_tables
@@ -48,7 +47,8 @@ def compare_stage(
     shown = metric or (ranking.metric if settings.search else None)
     maximised = not minimize and (ranking.maximised or shown != ranking.metric)
     study = study_of(sweep, settings.name, metric=metric, maximised=maximised or metric is None)
-    environments = _environments(sweep, settings.name)
+    short = ShortLabels.of(run.name for run in sweep.runs)
+    environments = [*mixed((run for run in sweep.runs if run.stage == settings.name), short)]
     document = {
         "sweep": sweep.name,
         "stage": settings.name,
@@ -78,18 +78,6 @@ def compare_stage(
         if table.rows:
             lines += [console_table(table), Text()]
     return document, Group(*lines)
-
-
-def _environments(sweep: Sweep, stage: str) -> list[str]:
-    """Sentences about tasks whose runs used different versions of an environment."""
-    short = ShortLabels.of(run.name for run in sweep.runs)
-    return list(
-        mixed(
-            (run.task, short(run.name), run.tags.get(names.TAG_ENVIRONMENT, ""))
-            for run in sweep.runs
-            if run.is_finished and run.stage == stage
-        )
-    )
 
 
 def _check_metric(read: SweepRead, stage: str, metric: str) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from music_rllib import names
 from music_rllib.envs.fingerprint import Fingerprint
 from music_rllib.errors import BadInputError
 from music_rllib.experiment.open_sweep import (
@@ -23,6 +24,7 @@ from music_rllib.experiment.plan import Node, continuation_key, make_plan
 from music_rllib.experiment.record import changes_since, keep_record
 from music_rllib.experiment.scheduler import Status
 from music_rllib.results.analysis import mixed
+from music_rllib.results.data import RunRecord
 from music_rllib.store.history import RunResult
 from music_rllib.store.lease import Lease
 from music_rllib.sweep.clean import remove_started, started_from
@@ -205,9 +207,14 @@ def test_runs_without_a_recorded_environment_are_used(tmp_path: Path) -> None:
 
 
 def test_a_comparison_names_runs_of_several_environments() -> None:
-    runs = [("Lab", "seed0", "aaaaaaaa"), ("Lab", "seed1", "bbbbbbbb"), ("Lab", "seed2", "")]
-    assert not list(mixed([*runs[:1], *runs[2:], ("Field", "seed0", "bbbbbbbb")]))
-    (line,) = mixed(runs)
+    def run(name: str, digest: str, task: str = "Lab", status: str = "FINISHED") -> RunRecord:
+        tags = {names.TAG_TASK: task, names.TAG_ENVIRONMENT: digest}
+        return RunRecord(run_id=name, name=name, status=status, tags=tags)
+
+    runs = [run("seed0", "aaaaaaaa"), run("seed1", "bbbbbbbb"), run("seed2", "")]
+    others = [run("seed0", "bbbbbbbb", "Field"), run("seed3", "cccccccc", status="KILLED")]
+    assert not list(mixed([runs[0], runs[2], *others]))
+    (line,) = mixed([*runs, *others])
     assert line == (
         "Runs on Lab are compared that used 2 versions of its environment: seed0 (aaaaaa); "
         "seed1 (bbbbbb)."

@@ -24,6 +24,7 @@ from matplotlib.collections import PolyCollection
 
 import music_rllib
 from music_rllib import names
+from music_rllib.report import build
 from music_rllib.report.build import WANTED, build_report, made_files, write_report
 from music_rllib.report.charts import _mean_at, chart_data, curves_csv
 from music_rllib.report.figures.choice import (
@@ -40,6 +41,7 @@ from music_rllib.results.conditions import SIDE_BY_SIDE, find_stages
 from music_rllib.results.data import Points, RunRecord, Sweep, columns
 from music_rllib.results.study import study_of
 from music_rllib.results.tables import performance_tables
+from tests.unit.report.conftest import no_files
 
 STEPS = range(20_000, 200_001, 20_000)
 
@@ -504,6 +506,7 @@ SWEEPS: dict[str, Callable[[], tuple[Sweep, Sequence[str]]]] = {
 }
 
 
+@pytest.mark.usefixtures("drawn")
 @pytest.mark.parametrize("state", SWEEPS)
 def test_any_state_of_a_sweep_has_a_page(state: str) -> None:
     sweep, expected = SWEEPS[state]()
@@ -555,6 +558,7 @@ def hostile() -> Sweep:
     )
 
 
+@pytest.mark.usefixtures("drawn")
 def test_a_script_in_any_text_of_a_sweep_is_escaped() -> None:
     made = replace(build_report(hostile()), command=SCRIPT, limitations=[SCRIPT])
     page = render(made)
@@ -711,19 +715,6 @@ def test_small_values_keep_their_digits() -> None:
     assert row_of(page, "Reacher", "q = 2", "return")[:1] == ["0.0031"]
 
 
-def test_files_are_the_same_in_several_processes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    report = build_report(compared({"1": [0.5], "1.5": [0.7]}))
-    made = []
-    for threads in (1, 2):  # no process is forked beside other threads
-        monkeypatch.setattr(threading, "active_count", lambda threads=threads: threads)
-        page = write_report(report, tmp_path / str(threads))
-        files = sorted((page.parent / "figures").iterdir())
-        made.append([(path.name, path.read_bytes()) for path in files])
-    assert made[0] == made[1]
-
-
 def test_a_legend_stays_inside_its_figure() -> None:
     report = build_report(of_stages(*STAGES))
     (drawing,) = [one for one in report.drawings if one.stage == SIDE_BY_SIDE]
@@ -757,21 +748,25 @@ def test_long_labels_of_axes_stay_inside_their_figure(width: float, font: int, c
 
 
 def test_a_new_report_removes_old_figures_and_equal_sweeps_have_equal_files(
-    tmp_path: Path,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Other files in the folder stay."""
+    """Other files in the folder stay. Several processes draw the same as one."""
     figures = tmp_path / "figures"
     figures.mkdir()
     (figures / "mine.png").touch()
     made = []
-    for stage in ("new", "old", "new"):
-        write_report(build_report(compared({"1": [0.5]}, stage=stage)), tmp_path)
-        shown = {"mine.png", "overview.png", "overview.svg"}
-        shown |= {f"{stage}-success-rate.png", f"{stage}-success-rate.svg"}
-        files = sorted(path for path in figures.iterdir() if not path.name.startswith("."))
-        assert {path.name for path in files} == shown
-        made.append([path.read_bytes() for path in files])
-    assert made[0] == made[2]
+    # No process is forked beside other threads.
+    for stage, threads in (("new", 1), ("old", 2), ("new", 2)):
+        monkeypatch.setattr(threading, "active_count", lambda threads=threads: threads)
+        monkeypatch.setattr(build, "files", no_files if stage == "old" else files)
+        report = build_report(compared({"1": [0.5], "1.5": [0.7]}, stage=stage))
+        write_report(report, tmp_path)
+        drawn = ("overview", *(drawing.name for drawing in report.drawings))
+        shown = {"mine.png", *(f"{name}{kind}" for name in drawn for kind in (".png", ".svg"))}
+        found = sorted(path for path in figures.iterdir() if not path.name.startswith("."))
+        assert {path.name for path in found} == shown
+        made.append([path.read_bytes() for path in found])
+    assert made[0] == made[2] != made[1]
     assert {name for name in made_files(tmp_path) if "figures" in name} == {
         f"figures/{name}" for name in shown - {"mine.png"}
     }

@@ -568,8 +568,9 @@ def test_a_plan_of_ten_thousand_runs_asks_a_bucket_for_less_than_a_minute(
 
     for name in costs:
         monkeypatch.setattr(pafs.FSSpecHandler, name, counted(name))
-    few, many = start(45), start(60)
-    assert few + (many - few) * (10_000 - 135) / 45 < 60
+    monkeypatch.setattr(node_store, "FEW", 8)  # both have more finished runs
+    few, many = start(10), start(15)
+    assert few + (many - few) * (10_000 - 30) / 15 < 60
 
 
 def last_checkpoint(sweep: OpenSweep, env_steps: int) -> WorkFolder:
@@ -1224,15 +1225,6 @@ def test_stop_leaves_a_driver_alone_that_writes_its_report(
         asked = program("stop", f"{storage}/mine", "--wait", "0", "--json").document
     assert asked == {"sweep": "mine", "was_running": False, "state": "finished"}
     assert sweep.location.read(sweep_files.STOP) is None
-
-
-@pytest.mark.parametrize("command", ["evaluate", "serve"])
-def test_an_empty_storage_is_refused(
-    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: Program
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    said = program(command, "q=1/seed0", "--storage", "")
-    assert (said.code, said.errors) == (2, "error: --storage must not be empty, got ''\n")
 
 
 def test_the_last_line_of_a_watch_ends(storage: str, tmp_path: Path, program: Program) -> None:
