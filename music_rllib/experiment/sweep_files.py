@@ -11,17 +11,18 @@ import contextlib
 import json
 import tempfile
 import time
-from collections.abc import Mapping, Set
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from music_rllib.command_line import plain
 from music_rllib.config.load import load_config
-from music_rllib.config.problems import shown
 from music_rllib.config.schema import SweepConfig
-from music_rllib.errors import BadInputError
+from music_rllib.errors import BadInputError, reason_of
 from music_rllib.redaction import redact
 from music_rllib.store.lease import runs_here, this_machine
 from music_rllib.store.node_store import NodeStore
@@ -204,18 +205,78 @@ def read_json(folder: StorageFolder, file: str) -> Any:
         document = None if data is None else json.loads(data)
     except (OSError, ValueError) as error:
         raise StorageError(f"{place} must be a readable JSON file: {error}") from error
-    has_keys = isinstance(document, dict) and document.keys() >= _KEYS.get(file, set())
-    if document is not None and file in _KEYS and not has_keys:
-        raise StorageError(
-            f"{place} must be a sweep's {file.removesuffix('.json')} as its driver writes it, got "
-            f"{shown(document)}; running the sweep again replaces it"
-        )
+    if document is not None and file in _CONTENTS:
+        try:
+            _CONTENTS[file].model_validate(document)
+        except ValidationError as error:
+            raise StorageError(
+                f"{place} must be a sweep's {file.removesuffix('.json')} as its driver writes it: "
+                f"{reason_of(error)}; running the sweep again replaces it"
+            ) from error
     return document
 
 
-_KEYS: dict[str, Set[str]] = {
-    CONFIG: {"stages"},
-    PLAN: {"nodes"},
-    STATE: {"sweep", "driver", "stages", "env_steps", "running", "best", "searches", "failures"},
-}
-"""File name to the keys that are read from it."""
+class _Content(BaseModel):
+    """What is read from a file; it may have more."""
+
+    model_config = ConfigDict(strict=True)
+
+
+class _Config(_Content):
+    stages: list[dict[str, Any]]
+
+
+class _Node(_Content):
+    key: str
+    label: str
+    input: str | None = None
+    env_steps: int = 0
+
+
+class _Plan(_Content):
+    nodes: list[_Node]
+    trials: list[dict[str, Any]] = []
+    earlier: list[_Node] = []
+    retrain: list[str] = []
+
+
+class _Driver(_Content):
+    machine: str
+    host: str
+    pid: int
+    started: float
+    heartbeat: float
+    ended: float | None
+    outcome: str
+
+
+class _StageState(_Content):
+    name: str
+    variant: str
+    trials: int
+    runs: dict[str, int]
+
+
+class _Best(_Content):
+    stage: str
+    values: dict[str, Any]
+    value: float
+    interval: Annotated[list[float | None], Field(min_length=2, max_length=2)]
+    """None without enough runs."""
+    runs: int
+    planned: int = 0
+
+
+class _State(_Content):
+    sweep: str
+    driver: _Driver
+    stages: list[_StageState]
+    env_steps: dict[str, int]
+    running: list[dict[str, Any]]
+    best: _Best | None
+    searches: list[dict[str, Any]]
+    pruned: list[str] = []
+    failures: list[dict[str, str]]
+
+
+_CONTENTS: dict[str, type[_Content]] = {CONFIG: _Config, PLAN: _Plan, STATE: _State}

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
 import itertools
 import json
+import operator
 import os
 import shutil
 import signal
@@ -726,22 +728,36 @@ def test_clean_is_refused_while_a_sweep_runs_that_shares_runs(
     assert program("clean", f"{storage}/mine").code == 0
 
 
-DAMAGED = {
-    "state.json": ("[]", ("status", "clean")),
-    "plan.json": ("{}", ("compare", "clean")),
-    "config.json": ("[]", ("status", "compare", "best", "clean")),
-}
+DAMAGED = [
+    ("state.json", [], ("status", "clean")),
+    ("state.json", ["driver", "outcome"], ("status", "compare", "clean")),
+    ("state.json", ["stages", 0, "runs"], ("status", "clean")),
+    ("plan.json", [], ("compare", "clean")),
+    ("plan.json", ["nodes", 0, "label"], ("status", "compare", "clean")),
+    ("config.json", [], ("status", "compare", "best", "clean")),
+]
 
 
 @IN_A_BUCKET
-@pytest.mark.parametrize("file", DAMAGED)
+@pytest.mark.parametrize(("file", "path", "commands"), DAMAGED)
 def test_a_damaged_record_ends_commands_with_its_place(
-    storage: str, tmp_path: Path, program: Program, file: str
+    storage: str,
+    tmp_path: Path,
+    program: Program,
+    file: str,
+    path: list[str | int],
+    commands: tuple[str, ...],
 ) -> None:
     played(storage, tmp_path)
-    content, commands = DAMAGED[file]
-    opened(storage, tmp_path, name="other").location.keep(file, content)
-    message = f"other/{file} must be a sweep's {file[:-5]} as its driver writes it, got {content}"
+    location = opened(storage, tmp_path, name="other").location
+    with StateFile(open_started(location)):
+        pass
+    document = [location.read(file)]
+    *above, last = [0, *path]
+    functools.reduce(operator.getitem, above, document)[last] = [5]
+    location.keep(file, as_json(document[0]))
+    place = ".".join(map(str, path))
+    message = f"other/{file} must be a sweep's {file[:-5]} as its driver writes it: {place}"
     for command in commands:
         said = program(command, f"{storage}/other")
         assert (said.code, message in said.errors) == (2, True)
