@@ -339,8 +339,13 @@ def test_the_live_page_of_a_study_half_way(
     state = {
         "env_steps": {"done": done, "left": 7_000_000 - done, "to_come": 0},
         "stages": [
-            {"name": stage, "runs": _counts(sweep, stage, planned)}
-            for stage, planned in (("pretrain", 20), ("music-r", 60))
+            {
+                "name": stage,
+                "variant": variant,
+                "trials": planned // 20,
+                "runs": _counts(sweep, stage, planned),
+            }
+            for stage, variant, planned in (("pretrain", "music-u", 20), ("music-r", "music-r", 60))
         ],
         "running": [
             {

@@ -41,7 +41,9 @@ def write_state(folder: Path, done: int, heartbeat: float, to_come: int = 0, **d
             "outcome": "running",
             **driver,
         },
-        "stages": [{"name": "train", "runs": {"started": 1, "waiting": 2}}],
+        "stages": [
+            {"name": "train", "variant": "tac", "trials": 3, "runs": {"started": 1, "waiting": 2}}
+        ],
         "env_steps": {"done": done, "left": 300 - done, "to_come": to_come},
         "running": [RUNNING],
         "best": None,
