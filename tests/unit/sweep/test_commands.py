@@ -752,7 +752,7 @@ def test_a_damaged_record_ends_commands_with_its_place(
     location = opened(storage, tmp_path, name="other").location
     with StateFile(open_started(location)):
         pass
-    document = [location.read(file)]
+    document: Any = [location.read(file)]
     *above, last = [0, *path]
     functools.reduce(operator.getitem, above, document)[last] = [5]
     location.keep(file, as_json(document[0]))
