@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from music_rllib.envs.episodes import Recording, lost_by_rounding, random_offsets
 from music_rllib.envs.features import Augmentation, Symmetries, Symmetry
-from music_rllib.envs.make import Env, name_of, reset_seed
+from music_rllib.envs.make import Env, in_environment, name_of, reset_seed
 from music_rllib.envs.tasks import (
     LAST_SEED,
 )
@@ -101,7 +101,7 @@ def _problem_of(
     Raises:
         BadNumberError: A step has another reward than its goals.
     """
-    first = env.reset(seed=seed_range[0])[0]
+    first = _reset(env, seed_range[0])
     start, distance, achieved, desired = _goals_near(first)
     together = reward(achieved, desired)
     if together.shape != (_ROWS,):
@@ -114,13 +114,19 @@ def _problem_of(
     reached = played.finish(terminated=False).frames[:, -len(start) :]
     distances = [distance, float(np.linalg.norm(reached - reached[0], axis=1).max())]
     for number in range(_TRIED_EPISODES):  # one function computes the rewards of all episodes
-        again = env.reset(seed=reset_seed(np.random.SeedSequence(number), seed_range))[0]
+        again = _reset(env, reset_seed(np.random.SeedSequence(number), seed_range))
         distances.append(_distance(again))
         if not np.abs(together - reward(achieved, desired)).max() <= tolerance:
             return _BY_GOALS, "rewards of the same goals change from episode to episode"
     # A goal may begin near the achieved one: those of hindsight lie as far away as the agent gets.
     lost = lost_by_rounding(reward, start, max(distances))
     return (_KEPT, lost) if lost else None
+
+
+def _reset(env: Env, seed: int) -> Any:
+    """The first observation; a call that hangs ends the worker, as in training."""
+    with in_environment:
+        return env.reset(seed=seed)[0]
 
 
 def _goals_near(first: Any) -> tuple[NDArray[Any], float, Floats, Floats]:
@@ -180,7 +186,7 @@ def goal_end_of(env: Env, seed: int = 0) -> GoalEnd | None:
     by_row = compute_terminated_of(env)
     if by_row is None:
         return None
-    _, _, start, near = _goals_near(env.reset(seed=seed)[0])
+    _, _, start, near = _goals_near(_reset(env, seed))
     achieved, desired = np.concatenate([start, near, near]), np.concatenate([near, start, near])
     try:
         expected = by_row(achieved, desired)
@@ -211,7 +217,8 @@ def _play_some(reward: GoalReward, env: Env, first: Any) -> Recording:
     ended = False
     while recording.steps < layout.horizon and not ended:
         action = rng.uniform(-1.0, 1.0, (1, layout.action)).astype(np.float32)
-        after, given, terminated, truncated, info = env.step(to_bounds(action, space)[0])
+        with in_environment:
+            after, given, terminated, truncated, info = env.step(to_bounds(action, space)[0])
         recording.step(action[0], given, info, after)
         ended = terminated or truncated
     return recording
@@ -232,7 +239,7 @@ def augmentation_of(
     known, reward = reward, reward or compute_reward_of(env)
     if reward is None or not goals:
         return augmentation
-    start = np.asarray(env.reset(seed=seed)[0]["achieved_goal"], np.float32)
+    start = np.asarray(_reset(env, seed)["achieved_goal"], np.float32)
     rows = 256
     inputs = np.zeros((2, rows, layout.network_input), np.float32)
     inputs[:, :, layout.observation :] = start
@@ -275,7 +282,7 @@ def moved_distance_of(env: Env, reward: GoalReward, seed: int = 0) -> float | No
     Raises:
         ValueError: The reward is dense, and there is no `distance_threshold`.
     """
-    start = np.asarray(env.reset(seed=seed)[0]["achieved_goal"], np.float32)[None]
+    start = np.asarray(_reset(env, seed)["achieved_goal"], np.float32)[None]
     jitter = np.float32(1e-6) * np.maximum(1.0, np.abs(start))
     # A smooth reward, such as exp(-distance**2), is flat within float32 next to the goal.
     near = [reward(start, start + np.float32(times) * jitter) for times in (1, 10, 100, 1000)]

@@ -100,7 +100,8 @@ def check_hung(record: str | None, attempt: str, what: str) -> None:
     recorded_attempt, seconds, stack = (*record.split("\n", 2), "", "")[:3]
     if recorded_attempt != attempt:
         return
-    place = place_in(stack, "env_runner.py") or "an unknown place"
+    places = (place_in(stack, file) for file in ("env_runner.py", "goal_functions.py"))
+    place = next(filter(None, places), "an unknown place")
     raise HangError(
         f"environment {what} has not returned from {_call_in(stack)} for {float(seconds):g} s "
         f"(resources.hang_minutes)\nit hangs at {place}\n{stack}"

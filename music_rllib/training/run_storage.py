@@ -277,7 +277,8 @@ class RunStorage:
             return
         kept = self._continuation
         try:
-            if any(steps_of(name) >= training.env_steps for name in kept.names()):
+            usable = self._changed_environment(kept.environment()) is None
+            if usable and any(steps_of(name) >= training.env_steps for name in kept.names()):
                 return
             with kept.new_checkpoint(training.env_steps, self._environment) as new:
                 training.save(new, alone=True)

@@ -138,6 +138,9 @@ class RunTrainable(Trainable):
         )
         if self._stopped or not evaluated:
             return self._result(done=False)
+        if not self._run_storage.work.names():  # a finished shorter run has reached `until`
+            assert self._training is not None
+            self._save(self._training)
         self._release()
         return self._result(done=True) | {PAUSED: self._history[-1].env_steps}
 

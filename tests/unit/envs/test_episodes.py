@@ -9,8 +9,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from music_rllib.envs.episodes import Recording, first_mismatch, lost_by_rounding
-from music_rllib.envs.goal_functions import goal_end_of, goal_reward_of
-from music_rllib.envs.make import make_env
+from music_rllib.envs.goal_functions import goal_end_of, goal_reward_of, moved_distance_of
+from music_rllib.envs.make import in_environment, make_env
 from music_rllib.envs.values import BadNumberError
 from music_rllib.replay.trajectories import ReplayLayout
 
@@ -283,6 +283,25 @@ def test_only_environments_that_are_known_to_never_end_have_no_function_for_it()
     assert ends is not None
     high = np.full((2, 2), 9.0, np.float32)
     assert ends(high, high).tolist() == [True, True]
+
+
+def test_calls_of_the_checks_are_watched_like_those_of_training() -> None:
+    """An environment that hangs only on a worker's machine would hang there first."""
+    watched: list[bool] = []
+
+    class Watched(gym.Wrapper[Any, Any, Any, Any]):
+        def reset(self, **options: Any) -> Any:
+            watched.append(in_environment._number[0] % 2 == 1)
+            return super().reset(**options)
+
+        def step(self, action: Any) -> Any:
+            watched.append(in_environment._number[0] % 2 == 1)
+            return super().step(action)
+
+    env = Watched(make_env("FetchPush-v4"))
+    moved_distance_of(env, goal_reward_of(env))
+    assert len(watched) > 1
+    assert all(watched)
 
 
 def test_the_end_of_a_wrapper_counts() -> None:
