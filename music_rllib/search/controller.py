@@ -95,6 +95,7 @@ class SearchController(Listener):
                 for study in search.studies:
                     study.heartbeat()
                     study.refresh()
+            self.recall()
         self._score_trials()
 
     def propose(self) -> None:
@@ -121,7 +122,8 @@ class SearchController(Listener):
                 with contextlib.suppress(*DATABASE_ERRORS):  # they are taken over in any case
                     study.release()
         with contextlib.suppress(*DATABASE_ERRORS):  # the plan lacks the trials of other drivers
-            self.recall()
+            for search in self.searches:  # begun ones, too: `clean` finds their checkpoints
+                self._recall(search, with_begun=True)
 
     def recall(self) -> None:
         """Add the runs of all ended trials to the plan; other drivers may have run them."""
@@ -143,26 +145,40 @@ class SearchController(Listener):
 
     # -- runs --------------------------------------------------------------------------------
 
-    def _recall(self, search: Search) -> None:
+    def _recall(self, search: Search, *, with_begun: bool = False) -> None:
         for study in search.studies:
             for trial in study.trials():
-                if not trial.state.is_finished() or VALUES not in trial.user_attrs:
+                if VALUES not in trial.user_attrs or trial._trial_id in search.recalled:
                     continue
-                reached = max(map(int, trial.user_attrs.get(SCORES, {})), default=0)
-                rung = search.rungs[min(reached, len(search.rungs) - 1)]
-                try:
-                    runs = self._plan_runs(search, study, trial, self._plan.seeds[: rung.seeds])
-                except ConfigError:
-                    continue  # the reason why the trial failed
-                for run in runs if trial.state is TrialState.COMPLETE else ():
-                    if run.key in self._removed and not self._scheduler.knows(run.key):
-                        self._request(run, None)  # the trial keeps its score
-                for node in (node for run in runs for node in self._plan.chain(run.key)):
-                    if not self._scheduler.knows(node.key):
-                        finished = self._store.is_finished(node.key)
-                        self._scheduler.add_pruned(node, finished=finished)
-                        if finished:
-                            self._reused(node)
+                if has_ended := trial.state.is_finished():
+                    search.recalled.add(trial._trial_id)
+                if has_ended or with_begun:
+                    with contextlib.suppress(ConfigError):  # the reason why the trial failed
+                        self._recall_trial(search, study, trial, has_ended=has_ended)
+
+    def _recall_trial(
+        self, search: Search, study: OptunaStudy, trial: FrozenTrial, *, has_ended: bool
+    ) -> None:
+        reached = max(map(int, trial.user_attrs.get(SCORES, {})), default=-1)
+        reached = max(reached, 0) if has_ended else reached + 1
+        rung = search.rungs[min(reached, len(search.rungs) - 1)]
+        runs = self._plan_runs(search, study, trial, self._plan.seeds[: rung.seeds])
+        # A pruned trial has finished its runs if its rung is one of seeds.
+        complete = (TrialState.COMPLETE, *[TrialState.PRUNED] * (rung.env_steps is None))
+        for run in runs if trial.state in complete else ():
+            chain = {node.key for node in self._plan.chain(run.key)}
+            if any(not self._scheduler.knows(key) for key in chain & self._removed):
+                self._request(run, None)  # the trial keeps its score
+        for node in (node for run in runs for node in self._plan.chain(run.key)):
+            if self._scheduler.knows(node.key):
+                continue
+            finished = self._store.is_finished(node.key)
+            if not has_ended:
+                self._scheduler.request(node, None, finished=finished)
+                continue
+            self._scheduler.add_pruned(node, finished=finished)
+            if finished:
+                self._reused(node)
 
     def _plan_runs(
         self,
@@ -286,7 +302,8 @@ class SearchController(Listener):
         scores: list[list[float]] = [[] for _ in settings.objectives]
         for run in runs:
             history = up_to(self._history(run.key), until)
-            budget = until or self._plan.node(run.key).run.env_steps
+            budget = self._plan.node(run.key).run.env_steps
+            budget = min(until or budget, budget)
             for objective, numbers in zip(settings.objectives, scores, strict=True):
                 try:
                     numbers.append(score(objective, history, budget))

@@ -16,7 +16,13 @@ from optuna.storages import BaseStorage, RDBStorage, get_storage
 from optuna.trial import FrozenTrial
 from sqlalchemy import create_engine, inspect
 from sqlalchemy.engine import URL, make_url
-from sqlalchemy.exc import ArgumentError, IntegrityError, ProgrammingError, SQLAlchemyError
+from sqlalchemy.exc import (
+    ArgumentError,
+    IntegrityError,
+    OperationalError,
+    ProgrammingError,
+    SQLAlchemyError,
+)
 
 from music_rllib import names
 from music_rllib.config.run_settings import RunSettings
@@ -81,6 +87,8 @@ class Search:
     running: list[RunningTrial] = field(default_factory=list)
     finalists: list[Finalist] | None = None
     """None until all studies have ended."""
+    recalled: set[int] = field(default_factory=set)
+    """Ids of the ended trials whose runs are in the plan."""
 
     @property
     def over(self) -> bool:
@@ -225,8 +233,12 @@ def open_studies(url: str) -> BaseStorage:
         # If two drivers find a new database at the same moment, one fails to create a table that
         # the other is creating, and finds it when it tries again.
         for wait in (0.5, 1.0, 2.0, 4.0):
-            with contextlib.suppress(IntegrityError, ProgrammingError):
+            try:
                 return _storage(parsed)
+            except (IntegrityError, ProgrammingError, OperationalError) as error:
+                # The last one is SQLite's; it also means that the database does not answer.
+                if isinstance(error, OperationalError) and "already exists" not in str(error):
+                    raise
             time.sleep(wait)
         return _storage(parsed)
 

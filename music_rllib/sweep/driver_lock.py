@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,6 +31,17 @@ def drivers_of(location: SweepLocation, *, watch: bool = False) -> list[Lease]:
     folder = location.files / DRIVERS
     files = [LeaseFile(folder, file) for file in folder.files() if not file.startswith(".")]
     return [lease for file in files if (lease := file.holder(watch=watch)) is not None]
+
+
+def others_drive(location: SweepLocation, state: Mapping[str, Any] | None) -> bool:
+    """Whether a process drives a sweep, other than the one that has written `state.json`.
+
+    A driver that has ended its state only sends records to MLflow or writes the report.
+    """
+    driver = {} if state is None else state["driver"]
+    writer = tuple(driver.get(key) for key in ("machine", "pid", "process_started"))
+    drivers = drivers_of(location)
+    return any((one.machine, one.pid, one.process_started) != writer for one in drivers)
 
 
 @dataclass(frozen=True)

@@ -83,6 +83,7 @@ def state_of(location: SweepLocation) -> dict[str, Any]:
     from music_rllib.experiment import sweep_files
     from music_rllib.experiment.record import earlier_text
     from music_rllib.store.node_store import NodeStore
+    from music_rllib.sweep.driver_lock import others_drive
 
     state = location.read(sweep_files.STATE)
     if state is None:
@@ -90,7 +91,10 @@ def state_of(location: SweepLocation) -> dict[str, Any]:
     outcome = state["driver"]["outcome"]
     if not sweep_files.is_alive(state):
         outcome = "interrupted" if outcome == "running" else outcome
-        _mark_interrupted(state)
+        if others_drive(location, state):
+            outcome = "running"  # another driver computes, and writes the state in a moment
+        else:
+            _mark_interrupted(state)
     store, nodes = NodeStore(location.storage), location.nodes()
     labels = {node["key"]: node["label"] for node in nodes}
     sources = {str(node["input"]) for node in nodes} - labels.keys()
@@ -140,7 +144,7 @@ def stop(
     """
     from music_rllib.experiment import sweep_files
     from music_rllib.experiment.sweep_files import find_sweep
-    from music_rllib.sweep.driver_lock import drivers_of
+    from music_rllib.sweep.driver_lock import others_drive
 
     location = find_sweep(sweep, storage)
     name = location.name
@@ -149,13 +153,7 @@ def stop(
     def runs() -> bool:
         """Whether a driver computes runs, or is starting and has no state yet."""
         state = location.read(sweep_files.STATE)
-        if sweep_files.is_alive(state):
-            return True
-        # The driver that has ended its state only sends records to MLflow or writes the report.
-        driver = {} if state is None else state["driver"]
-        ended = tuple(driver.get(key) for key in ("machine", "pid", "process_started"))
-        drivers = drivers_of(location)
-        return any((one.machine, one.pid, one.process_started) != ended for one in drivers)
+        return sweep_files.is_alive(state) or others_drive(location, state)
 
     deadline = time.monotonic() + wait
     is_running = was_running = runs()

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
+import socket
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -22,8 +24,10 @@ from music_rllib.store.history import Report, RunResult, last_values
 from music_rllib.tracking.sender import Pending
 
 TARGETS = ".prometheus"
-"""Folder beside the sweeps' folders; its NAME.json has the addresses of this Ray's metrics.
-Prometheus' file_sd needs the files of all sweeps in one folder."""
+"""Folder beside the sweeps' folders, since Prometheus' file_sd needs all files in one. A driver has
+a file NAME.HOST-PID.json with the addresses of its Ray's metrics."""
+STALE_SECONDS = 3600.0
+"""Age of the files of drivers that were killed. A driver writes its own again each minute."""
 SET_SECONDS = 2.0
 KEPT = 100
 """Number of ended runs that are still exported, the newest ones, so that the export does not grow
@@ -73,7 +77,9 @@ class PrometheusListener(Listener):
         self._sweep = sweep
         self._scheduler = scheduler
         self._pending = pending
-        self._targets = folder.parent / TARGETS / f"{folder.name}.json"
+        own = f"{folder.name}.{socket.gethostname()}-{os.getpid()}.json"
+        self._targets, self._addresses = folder.parent / TARGETS / own, b""
+        self._next_written = 0.0
         self._now = now
         self._next_set = 0.0
         self._gauges: dict[str, Any] = {}
@@ -141,6 +147,9 @@ class PrometheusListener(Listener):
     def _set_all(self) -> None:
         if not self._gauges:
             self._create_gauges()
+        if self._now() >= self._next_written:
+            write_atomically(self._targets, self._addresses)
+            self._next_written = self._now() + STALE_SECONDS / 60
         for tags, values in self._values.values():
             for gauge, value in values.items():
                 self._gauges[gauge].set(value, tags=tags)
@@ -156,7 +165,7 @@ class PrometheusListener(Listener):
         self._gauges["music_undelivered_records"].set(pending.records, tags=tags)
 
     def _create_gauges(self) -> None:
-        """Create the gauges in Ray, and write the addresses for Prometheus."""
+        """Create the gauges in Ray, and find the addresses for Prometheus."""
         import ray
         from ray.util.metrics import Gauge
 
@@ -169,4 +178,7 @@ class PrometheusListener(Listener):
         # Equal labels: Prometheus scrapes an address once, however many sweeps name it.
         entry = {"labels": {"job": "music_rllib"}, "targets": targets}
         self._targets.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(self._targets, json.dumps([entry], indent=1).encode())
+        for file in self._targets.parent.iterdir():
+            if time.time() - file.stat().st_mtime > STALE_SECONDS:
+                file.unlink(missing_ok=True)
+        self._addresses = json.dumps([entry], indent=1).encode()

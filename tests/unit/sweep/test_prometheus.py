@@ -1,5 +1,7 @@
 """Metrics that a sweep exports for Prometheus; a recorder replaces Ray's gauges."""
 
+import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ from music_rllib import names
 from music_rllib.experiment.plan import Plan, make_plan
 from music_rllib.experiment.scheduler import Scheduler
 from music_rllib.store.history import Report, RunResult
+from music_rllib.sweep.listeners import prometheus
 from music_rllib.sweep.listeners.prometheus import PrometheusListener
 from music_rllib.tracking.sender import Pending
 from tests.sweep_files import loaded
@@ -48,6 +51,10 @@ def plan(tmp_path: Path) -> Plan:
     return make_plan(loaded(tmp_path, document))
 
 
+def nothing() -> Pending:
+    return Pending(records=0, error=None)
+
+
 def report(env_steps: int, success: float) -> Report:
     metrics = {names.ENV_STEPS: float(env_steps), names.EVAL_SUCCESS: success}
     return Report(env_steps=env_steps, seconds=env_steps / 100, timestamp_ms=0, metrics=metrics)
@@ -56,12 +63,9 @@ def report(env_steps: int, success: float) -> Report:
 def test_what_is_exported_does_not_grow_with_the_runs_that_ended(
     exported: dict[str, dict[str, float]], plan: Plan, tmp_path: Path
 ) -> None:
-    def pending() -> Pending:
-        return Pending(records=0, error=None)
-
     now = iter(range(0, 1000, 10))
     gauges = PrometheusListener(
-        "s", Scheduler(plan, set()), pending, tmp_path / "s", now=lambda: next(now)
+        "s", Scheduler(plan, set()), nothing, tmp_path / "s", now=lambda: next(now)
     )
     slow, *others = plan.nodes
     paused = others.pop()
@@ -85,10 +89,38 @@ def test_a_run_that_waits_for_cpus_is_not_exported_as_started(
     exported: dict[str, dict[str, float]], plan: Plan, tmp_path: Path
 ) -> None:
     scheduler = Scheduler(plan, set())
-    listener = PrometheusListener("s", scheduler, lambda: Pending(records=0, error=None), tmp_path)
+    listener = PrometheusListener("s", scheduler, nothing, tmp_path)
     for node in plan.nodes[:3]:
         scheduler.start(node.key)  # passed to Ray Tune
     listener.started(plan.nodes[0])  # by a worker
     listener.tick()
     runs = exported["music_runs"]
     assert (runs["started"], runs["waiting"]) == (1, 7), "as in `status`"
+
+
+def test_drivers_of_one_sweep_are_scraped_until_each_ends(
+    exported: dict[str, dict[str, float]],
+    plan: Plan,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    listeners = []
+    killed = tmp_path / prometheus.TARGETS / "s.elsewhere-1.json"
+    killed.parent.mkdir()
+    killed.touch()
+    os.utime(killed, (0, 0))
+    for pid in (1, 2):
+        node = {"Alive": True, "MetricsExportPort": pid, "NodeManagerAddress": "host"}
+        monkeypatch.setattr(ray, "nodes", lambda node=node: [node])
+        monkeypatch.setattr(os, "getpid", lambda pid=pid: pid)
+        scheduler = Scheduler(plan, set())
+        listeners.append(PrometheusListener("s", scheduler, nothing, tmp_path / "s"))
+        listeners[-1].tick()
+
+    def scraped() -> set[str]:
+        files = killed.parent.glob("*.json")
+        return {target for file in files for target in json.loads(file.read_text())[0]["targets"]}
+
+    assert scraped() == {"host:1", "host:2"}
+    listeners[0].close()
+    assert scraped() == {"host:2"}
