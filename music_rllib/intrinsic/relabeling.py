@@ -118,9 +118,15 @@ class RewardLearner:
         """The reward's own measures since the last call.
 
         Raises:
-            ValueError: A name is not one of an intrinsic reward, so that it could replace another.
+            ValueError: They are no numbers by name, or a name is not one of an intrinsic reward, so
+                that it could replace another.
         """
         found = self.reward.metrics()
+        try:
+            found = {name: float(value) for name, value in found.items()}
+        except (AttributeError, TypeError, ValueError, RuntimeError) as error:
+            rule = f"{type(self.reward).__name__}.metrics must return a dictionary of numbers"
+            raise ValueError(f"{rule}: {one_line(error)}") from error
         for name in found:
             if not name.startswith("intrinsic/") or name in _RESERVED:
                 rule = "must begin with intrinsic/ and not be " + " or ".join(_RESERVED)

@@ -158,8 +158,9 @@ def _other_folder(folder: Path) -> PolicyError | None:
     """The error for a sweep, or the sub-folders that `best` writes for tasks; None for others."""
     if (folder / "plan.json").is_file():
         return PolicyError(
-            f"{folder} must hold a policy, and is a sweep: give the label of one of its runs, or "
-            f"write its best policy with 'music-rllib best {folder}'"
+            f"{folder} must hold a policy, and is a sweep: give one of its runs (for commands its "
+            f"label, for load_policy {folder.parent}/nodes/KEY), or write its best policy with "
+            f"'music-rllib best {folder}'"
         )
     policies = [str(child.parent) for child in sorted(folder.glob("*/handoff"))]
     if not policies or (folder / "handoff").exists() or (folder / HANDOFF_FILE).exists():

@@ -353,6 +353,7 @@ class TrajectoryReplay(TrajectoryRing):
                 f"trajectory {wanted} must be in the checkpoint's files, but is missing"
             )
         self._priorities = np.array(index["priorities"], np.float64)
+        self._values = None  # otherwise those of earlier episodes would count as the checkpoint's
         if "values" in index:
             self._row_values()[ranges(self._starts, self._lengths)] = index["values"]
         if self._only_moved:

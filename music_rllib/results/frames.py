@@ -75,7 +75,7 @@ class Frames:
     """A sentence about runs of earlier versions of the sweep, which are not in the frames."""
 
 
-def load_sweep(place: str | Path, *, storage: str | None = None) -> Frames:
+def load_sweep(place: str | Path, *, storage: str | Path | None = None) -> Frames:
     """Load the runs, curves and conditions of a sweep as pandas frames.
 
     Args:
@@ -87,7 +87,8 @@ def load_sweep(place: str | Path, *, storage: str | None = None) -> Frames:
         BadInputError: There is no such sweep, or the folder holds something else.
         StorageError: The storage can't be read, or finished runs in it are damaged.
     """
-    return frames_of(read_sweep(str(place), storage).sweep)
+    within = None if storage is None else str(storage)
+    return frames_of(read_sweep(str(place), within).sweep)
 
 
 def frames_of(sweep: Sweep) -> Frames:

@@ -174,7 +174,10 @@ class TACConfigBase(AlgorithmConfig):
             TypeError: unknown setting.
         """
         if task_symmetries is not NotProvided and not _is_searched(task_symmetries):
-            task_symmetries = Symmetries.model_validate(task_symmetries)
+            try:
+                task_symmetries = Symmetries.model_validate(task_symmetries)
+            except ValidationError as error:
+                raise _in_words(error, task_symmetries, Symmetries, "task_symmetries.") from None
         fields = _prefixed("replay", settings, ReplaySettings)
         return self._set(fields, moved_distance=moved_distance, task_symmetries=task_symmetries)
 
@@ -229,6 +232,12 @@ class TACConfigBase(AlgorithmConfig):
 
     # -- reading --------------------------------------------------------------------------
 
+    def get_evaluation_config_object(self) -> Any:
+        found = super().get_evaluation_config_object()
+        if found is not None and not self.evaluation_config:  # RLlib allows None
+            found.explore = False
+        return found
+
     @property
     def settings(self) -> AlgorithmSettings:
         """The validated settings; raises ValueError that names each problem."""
@@ -243,9 +252,7 @@ class TACConfigBase(AlgorithmConfig):
         try:
             return model.model_validate(values)
         except ValidationError as error:
-            found = problems_of(error, values, model)
-            lines = (f"{prefix}{'.'.join(map(str, path))} {rule}".lstrip() for path, rule in found)
-            raise ValueError("\n".join(lines)) from None
+            raise _in_words(error, values, model, prefix) from None
 
     def validate(self) -> None:
         if not self.in_evaluation and (problems := list(ignored_settings(self))):
@@ -259,8 +266,10 @@ class TACConfigBase(AlgorithmConfig):
             ("training(total_env_steps=...)", self.total_env_steps, 1),
             ("training(torch_threads=...)", self.torch_threads, 1),
         ):
-            if value is not None and value < least:
+            if value is not None and (isinstance(value, str) or value < least):
                 self._value_error(f"{name} must be >= {least}, got {value}")
+        if self.moved_distance is not None and not self.moved_distance > 0:
+            self._value_error(f"replay(moved_distance=...) must be > 0, got {self.moved_distance}")
         if self.num_learners > 1:
             self._value_error(
                 f"num_learners must be 0 or 1, got {self.num_learners}: one update of TAC is too "
@@ -364,6 +373,15 @@ _MODELS: tuple[tuple[type[BaseModel], str], ...] = (
 )
 """Types of `AlgorithmSettings`, and the prefix of their fields as attributes of the config."""
 _FIELDS = frozenset(prefix + name for model, prefix in _MODELS for name in model.model_fields)
+
+
+def _in_words(
+    error: ValidationError, values: Any, model: type[BaseModel], prefix: str
+) -> ValueError:
+    """The error of pydantic about `values` with one line per problem."""
+    found = problems_of(error, values, model)
+    lines = (f"{prefix}{'.'.join(map(str, path))} {rule}".lstrip() for path, rule in found)
+    return ValueError("\n".join(lines))
 
 
 def _is_searched(value: Any) -> bool:

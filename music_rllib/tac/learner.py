@@ -34,7 +34,7 @@ from music_rllib.replay.trajectories import Floats, Trajectory
 from music_rllib.runtime.process import keep_freed_memory, use_reproducible_gpu_kernels
 from music_rllib.runtime.quiet import quiet_third_parties
 from music_rllib.schedules import Quantity
-from music_rllib.tac import diagnostics
+from music_rllib.tac import diagnostics, schedulers
 from music_rllib.tac.compiled_update import (
     CompiledUpdate,
     FusedAdam,
@@ -49,7 +49,6 @@ from music_rllib.tac.minibatches import INTRINSIC, STORED, Minibatch, Minibatche
 from music_rllib.tac.networks import RunningNormaliser
 from music_rllib.tac.random_state import generator_states, set_generators
 from music_rllib.tac.rl_module import ESTIMATOR_MODULE, TACForward, TACModule, mean_values
-from music_rllib.tac.schedulers import add_schedulers, load_scheduler_states, scheduler_states
 
 GRAD_UPDATES = "grad_updates"
 
@@ -70,7 +69,7 @@ class TACLearner(TorchLearner):
         if self.config.num_gpus_per_learner:
             use_reproducible_gpu_kernels()
         super().build()
-        add_schedulers(self)
+        schedulers.add_schedulers(self)
         seed = self.config.seed if self.config.seed is not None else torch.seed()
         self._generator = torch.Generator(device=self._device).manual_seed(seed + 7919)
         self._grad_updates = 0
@@ -397,7 +396,7 @@ class TACLearner(TorchLearner):
             GRAD_UPDATES: self._grad_updates,
             "held_out": self._music.state(),
             "scheduled": self._now.state(),
-            "schedulers": scheduler_states(self),
+            "schedulers": schedulers.scheduler_states(self),
             **({} if self.bonus is None else {"intrinsic": self.bonus.state()}),
         }
         return state
@@ -405,6 +404,7 @@ class TACLearner(TorchLearner):
     def _set_optimizer_state(self, state: StateDict) -> None:
         known = self._named_optimizers  # for another one, RLlib would register all of them again
         super()._set_optimizer_state({name: state[name] for name in state if name in known})
+        schedulers.apply_configured_rates(self)
 
     def set_state(self, state: StateDict) -> None:
         # RLlib ignores weights with an older sequence number; a restored state replaces newer ones.
@@ -415,6 +415,6 @@ class TACLearner(TorchLearner):
             set_generators(self._generator, state["tac"], self._grad_updates)
             self._music.load_state(state["tac"]["held_out"])
             self._now.load_state(state["tac"]["scheduled"])
-            load_scheduler_states(self, state["tac"].get("schedulers", {}))
+            schedulers.load_scheduler_states(self, state["tac"].get("schedulers", {}))
             if self.bonus is not None and "intrinsic" in state["tac"]:
                 self.bonus.load_state(state["tac"]["intrinsic"])

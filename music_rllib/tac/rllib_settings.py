@@ -30,7 +30,7 @@ _REMEDIES: dict[str, tuple[str, ...]] = {
         "train_batch_size", "_train_batch_size_per_learner", "num_epochs", "minibatch_size",
         "shuffle_batch_per_epoch", "num_aggregator_actors_per_learner",
     ),
-    _NETWORKS: ("model", "_model_config"),
+    _NETWORKS: ("model",),
     "override TACLearner.configure_optimizers_for_module": ("optimizer",),
     "set training(...) and music(...)": ("algorithm_config_overrides_per_module",),
     _NO_CONNECTORS: (
@@ -127,6 +127,9 @@ def _unusable_classes(config: AlgorithmConfig) -> Iterator[str]:
         if not issubclass(found, needed):
             yield f"{name} must be a subclass of {needed.__name__}, got {found.__name__}"
     spec = config._rl_module_spec
+    is_own = getattr(spec, "module_class", None) not in (None, TACModule)
+    if config._model_config and not is_own:
+        yield f"model_config={_short(config._model_config)} has no effect on TAC: {_NETWORKS}"
     if spec is None:
         return
     if not isinstance(spec, RLModuleSpec):

@@ -40,3 +40,13 @@ def load_scheduler_states(learner: TorchLearner, states: Mapping[str, Any]) -> N
             known = learner._lr_schedulers.get(module, {}).get(name, ())
             for scheduler, state in zip(known, own, strict=False):
                 scheduler.load_state_dict(state)
+
+
+def apply_configured_rates(learner: TorchLearner) -> None:
+    """Replace the fixed learning rates of a checkpoint by those of the configuration.
+
+    RLlib does so only after the updates of the next call. Schedules continue with their own rates.
+    """
+    for optimizer, schedule in learner._optimizer_lr_schedules.items():
+        if not (learner._lr_schedulers or schedule.use_schedule):
+            learner._set_optimizer_lr(optimizer, lr=schedule.get_current_value())

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from music_rllib import TAC, TACConfig, TACModule
 from music_rllib.intrinsic.interface import IntrinsicReward, Sizes
+from music_rllib.tac.learner import TACLearner
 
 pytestmark = pytest.mark.usefixtures("local_ray")
 
@@ -138,6 +139,41 @@ def test_what_has_no_effect_is_refused(
 ) -> None:
     with pytest.raises(ValueError, match=message):
         change(config()).validate()
+
+
+def test_another_lr_after_a_restore_counts_from_the_first_update(tmp_path: Path) -> None:
+    source = built(config(lr=1e-3))
+    source.train()
+    source.save_to_path(str(tmp_path))
+    other = built(config(lr=1e-5))
+    other.restore_from_path(str(tmp_path))
+    learner = other.learner_group._learner
+    assert isinstance(learner, TACLearner)
+    assert learner._adam["networks"].param_groups[0]["lr"] == 1e-5
+
+
+def test_evaluation_without_overrides_takes_the_mean_action() -> None:
+    made = config().evaluation(evaluation_interval=1, evaluation_config=None)
+    evaluation = made.get_evaluation_config_object()
+    assert evaluation is not None
+    assert evaluation.explore is False
+
+
+def test_model_config_is_for_a_module_of_ones_own() -> None:
+    own = RLModuleSpec(module_class=type("Own", (TACModule,), {}))
+    config().rl_module(rl_module_spec=own, model_config={"width": 3}).validate()
+    for spec in ({}, {"rl_module_spec": RLModuleSpec()}):
+        with pytest.raises(ValueError, match=r"model_config=.* has no effect"):
+            config().rl_module(model_config={"width": 3}, **spec).validate()
+
+
+def test_replay_settings_of_a_task_are_checked_like_others() -> None:
+    with pytest.raises(ValueError, match=r"^task_symmetries\.miror is not a known setting"):
+        config().replay(task_symmetries={"miror": {"signs": [1]}})
+    with pytest.raises(ValueError, match=r"moved_distance=...\) must be > 0, got -1"):
+        config().replay(moved_distance=-1).validate()
+    with pytest.raises(ValueError, match=r"total_env_steps=...\) must be >= 1, got 5"):
+        config(total_env_steps="5").validate()
 
 
 def test_defaults_are_values_and_a_forgotten_environment_is_named() -> None:

@@ -484,3 +484,13 @@ def test_names_that_mlflow_refuses(name: str) -> None:
     vars(learner)["reward"] = Reward()
     with pytest.raises(ValueError, match=r"names in Reward\.metrics"):
         learner.metrics()
+
+
+@pytest.mark.parametrize("found", [None, {"intrinsic/x": "abc"}, {"intrinsic/x": torch.ones(2)}])
+def test_metrics_must_be_numbers(found: Any) -> None:
+    class Forgot(Speed):
+        def metrics(self) -> dict[str, float]:
+            return found  # type: ignore[no-any-return]
+
+    with pytest.raises(ValueError, match=r"Forgot\.metrics must return a dictionary of numbers"):
+        RewardLearner(Forgot(SIZES), 1e-3, frozen=False).metrics()

@@ -556,3 +556,13 @@ def test_values_of_an_episode_stay_with_its_steps_and_are_restored() -> None:
         np.testing.assert_array_equal(
             each.values_of(batch.rows), 10 * batch.actions[:, 0] + batch.actions[:, 1]
         )
+
+
+def test_values_of_other_episodes_do_not_survive_a_checkpoint_without_values() -> None:
+    without, used = replay(20), replay(20)
+    without.extend([episode(0, 3)])
+    used.extend([episode(0, 3)], values=[np.full(3, 7.0, np.float32)])
+    used.load_state(without.state())
+    assert used.values_of(np.arange(3)) is None
+    with pytest.raises(ValueError, match="reward must be that of the checkpoint"):
+        used.extend([episode(1, 1)], values=[np.ones(1, np.float32)])

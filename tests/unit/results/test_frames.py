@@ -240,3 +240,8 @@ def test_a_run_without_a_report_has_its_initial_settings(
 ) -> None:
     frame = frames_of(of_stage(tmp_path, {"tac": setting}, done=False)).runs
     assert (set(frame.q), set(frame.alpha)) == ({q}, {alpha})
+
+
+def test_the_storage_of_a_sweep_can_be_a_path(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="must be a sweep that was started"):
+        load_sweep("nope", storage=tmp_path)
