@@ -15,6 +15,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from music_rllib import names
 from music_rllib.config.tac_settings import setting_text
 from music_rllib.experiment.plan import Node
@@ -27,7 +29,7 @@ TARGETS = ".prometheus"
 """Folder beside the sweeps' folders, since Prometheus' file_sd needs all files in one. A driver has
 a file NAME.HOST-PID.json with the addresses of its Ray's metrics."""
 STALE_SECONDS = 3600.0
-"""Age of the files of drivers that were killed. A driver writes its own again each minute."""
+"""Age of the files of drivers that were killed elsewhere. A driver writes its own each minute."""
 SET_SECONDS = 2.0
 KEPT = 100
 """Number of ended runs that are still exported, the newest ones, so that the export does not grow
@@ -178,7 +180,9 @@ class PrometheusListener(Listener):
         # Equal labels: Prometheus scrapes an address once, however many sweeps name it.
         entry = {"labels": {"job": "music_rllib"}, "targets": targets}
         self._targets.parent.mkdir(parents=True, exist_ok=True)
-        for file in self._targets.parent.iterdir():
-            if time.time() - file.stat().st_mtime > STALE_SECONDS:
+        for file in self._targets.parent.iterdir():  # also of drivers that were killed
+            _, here, pid = file.stem.rpartition(f".{socket.gethostname()}-")
+            is_dead = here and pid.isdigit() and not psutil.pid_exists(int(pid))
+            if is_dead or time.time() - file.stat().st_mtime > STALE_SECONDS:
                 file.unlink(missing_ok=True)
         self._addresses = json.dumps([entry], indent=1).encode()

@@ -2,6 +2,7 @@
 
 import json
 import os
+import socket
 from pathlib import Path
 from typing import Any
 
@@ -105,12 +106,14 @@ def test_drivers_of_one_sweep_are_scraped_until_each_ends(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     listeners = []
-    killed = tmp_path / prometheus.TARGETS / "s.elsewhere-1.json"
-    killed.parent.mkdir()
-    killed.touch()
-    os.utime(killed, (0, 0))
-    for pid in (1, 2):
-        node = {"Alive": True, "MetricsExportPort": pid, "NodeManagerAddress": "host"}
+    folder = tmp_path / prometheus.TARGETS
+    folder.mkdir()
+    (folder / "s.elsewhere-1.json").touch()
+    os.utime(folder / "s.elsewhere-1.json", (0, 0))
+    (folder / f"s.{socket.gethostname()}-{2**22 + 1}.json").touch()  # no process has this pid
+    for pid in (os.getpid(), os.getppid()):
+        port = len(listeners) + 1
+        node = {"Alive": True, "MetricsExportPort": port, "NodeManagerAddress": "host"}
         monkeypatch.setattr(ray, "nodes", lambda node=node: [node])
         monkeypatch.setattr(os, "getpid", lambda pid=pid: pid)
         scheduler = Scheduler(plan, set())
@@ -118,7 +121,7 @@ def test_drivers_of_one_sweep_are_scraped_until_each_ends(
         listeners[-1].tick()
 
     def scraped() -> set[str]:
-        files = killed.parent.glob("*.json")
+        files = folder.glob("*.json")
         return {target for file in files for target in json.loads(file.read_text())[0]["targets"]}
 
     assert scraped() == {"host:1", "host:2"}
