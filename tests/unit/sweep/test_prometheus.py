@@ -105,7 +105,7 @@ def test_drivers_of_one_sweep_are_scraped_until_each_ends(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    listeners = []
+    listeners: list[PrometheusListener] = []
     folder = tmp_path / prometheus.TARGETS
     folder.mkdir()
     (folder / "s.elsewhere-1.json").touch()
