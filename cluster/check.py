@@ -491,7 +491,7 @@ def _objects(resources: Any, folder: Path) -> list[dict[str, Any]]:
             objects += yaml.safe_load_all(target.read_text(encoding="utf-8"))
         elif (inner := target / "kustomization.yaml").is_file():
             inner_document = yaml.safe_load(inner.read_text(encoding="utf-8"))
-            objects += _objects(inner_document["resources"], target)
+            objects += _objects((inner_document or {}).get("resources") or (), target)
     return [one for one in objects if isinstance(one, dict)]
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import json
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -201,13 +200,10 @@ def _grid_points(grid: Mapping[str, list[Any]]) -> list[PlacedPoint]:
 
 
 def _forbid_equal_points(points: tuple[Point, ...], findings: Findings) -> None:
-    """Reject two points that are the same trial.
-
-    Such as two spellings of one schedule, or two weights of an intrinsic reward that is not given.
-    """
+    """Reject two points with the same settings, such as two spellings of one schedule."""
     seen = set()
     for point in points:
-        runs = tuple(json.dumps(run.identity()) for run in point.runs.values())
+        runs = tuple(run.model_dump_json() for run in point.runs.values())
         if runs and runs in seen:
             findings.add(
                 ("grid",), f"must not have two equal points, got {shown(point.values)} again"

@@ -135,10 +135,10 @@ class Plan:
         return tuple({handoff.key: handoff for handoff in found}.values())
 
     @property
-    def transfers(self) -> list[tuple[Task, Task]]:
-        """The source's and the run's task, of stages that take over the agent of another task."""
+    def transfers(self) -> list[tuple[Source, Task]]:
+        """The source and the run's task, of stages that take over the agent of another task."""
         return [
-            (stage.source.task, task)
+            (stage.source, task)
             for stage in self._stages.values()
             if stage.source and stage.source.task and VARIANTS[stage.variant].starts_from == "agent"
             for task in stage.tasks
@@ -281,6 +281,15 @@ def _shared_runs(plan: Plan) -> Iterator[str]:
         for run in plan.runs
         for first in [plan.node(run.key)]
     )
+    points = Counter(
+        run.stage
+        for run in plan.runs
+        for first in [plan.node(run.key)]
+        if not run.part and (run.stage, run.task) == (first.stage, first.task)
+        if run.trial != first.trial
+    )
+    for stage, count in points.items():
+        yield f"{stage}: {in_runs(count)} equal to runs of other points of its grid: trained once"
     stages: Counter[tuple[str, str]] = Counter()
     for (stage, task, first_stage, first_task), count in counts.items():
         if stage != first_stage:
@@ -337,9 +346,9 @@ def node_key(run: RunSettings, source: str | None, algorithm: str | None = None)
     return content_key(content)
 
 
-def continuation_key(run: RunSettings, source: str | None) -> str:
-    """Key that all runs share which differ only in their budget."""
-    return node_key(run.model_copy(update={"env_steps": 0}), source)
+def continuation_key(run: RunSettings, source: str | None, algorithm: str | None = None) -> str:
+    """Key that all runs share which differ only in their budget; `algorithm` as in `node_key`."""
+    return node_key(run.model_copy(update={"env_steps": 0}), source, algorithm)
 
 
 def budget_settings(run: RunSettings) -> list[str]:

@@ -131,21 +131,27 @@ def _earlier_runs(sweep: OpenSweep) -> list[dict[str, Any]]:
 
 
 def results_of_other_budgets(sweep: OpenSweep) -> dict[str, int]:
-    """By continuation key: the time in ms of the first result of an earlier plan's runs.
+    """By key of a planned node: the time in ms of the first result of runs that begin like it.
 
-    These runs begin like those of the plan and differ in `env_steps`: a hypothesis that is newer
-    than their results is not planned.
+    These are runs of an earlier plan or of another stage with other `env_steps`. A hypothesis that
+    is newer than their results is not planned.
     """
-    own = {node.key for node in sweep.plan.nodes}
     recorded = (*sweep.recorded.get("nodes", ()), *sweep.recorded.get("earlier", ()))
-    earlier = [one for one in recorded if one["key"] not in own and "continuation" in one]
+    known = {one["key"]: one["continuation"] for one in recorded if "continuation" in one}
+    own = {
+        node.key: known.get(node.key)
+        or continuation_key(node.run, node.source_key, sweep.plan.algorithm)
+        for node in sweep.plan.nodes
+    }
+    known |= own
+    counts, ours = Counter(known.values()), {*own.values()}
+    shared = [key for key, of in known.items() if counts[of] > 1 and of in ours]
     times: dict[str, int] = {}
-    for key in sweep.store.finished(one["key"] for one in earlier) if earlier else ():
+    for key in sweep.store.finished(shared) if shared else ():
         with contextlib.suppress(StorageError):  # the time of a damaged run is not known
             time = sweep.store.history(key)[-1].timestamp_ms
-            continuation = next(one["continuation"] for one in earlier if one["key"] == key)
-            times[continuation] = min(times.get(continuation, time), time)
-    return times
+            times[known[key]] = min(times.get(known[key], time), time)
+    return {key: times[of] for key, of in own.items() if of in times}
 
 
 def earlier_text(location: SweepLocation) -> str | None:

@@ -26,7 +26,6 @@ from music_rllib.config.schema import Hypothesis, Stage, SweepConfig
 from music_rllib.config.tac_settings import setting_text
 from music_rllib.errors import reason_of
 from music_rllib.experiment.open_sweep import OpenSweep
-from music_rllib.experiment.plan import continuation_key
 from music_rllib.experiment.record import results_of_other_budgets
 from music_rllib.experiment.sweep_files import ANALYSIS_PLAN, SweepLocation, as_json
 from music_rllib.schedules import StrictModel
@@ -354,10 +353,7 @@ def record_plan(
     sweep.location.keep(PLANS_TO_READ, as_markdown(sweep.config.name, versions))
     shown = results_of_other_budgets(sweep)
     done = {
-        node.stage
-        for node in sweep.plan.nodes
-        if node.key in sweep.finished
-        or (shown and continuation_key(node.run, node.source_key) in shown)
+        node.stage for node in sweep.plan.nodes if node.key in sweep.finished or node.key in shown
     }
     known = [one.plan for one in before if plan.has_same_test(one.plan)]
     return versions, tuple(

@@ -23,7 +23,7 @@ from music_rllib.envs.fingerprint import digest_of
 from music_rllib.errors import reason_of
 from music_rllib.experiment import sweep_files
 from music_rllib.experiment.open_sweep import OpenSweep, open_started
-from music_rllib.experiment.plan import Node, continuation_key
+from music_rllib.experiment.plan import Node
 from music_rllib.experiment.record import earlier_text, results_of_other_budgets
 from music_rllib.experiment.run_info import run_info
 from music_rllib.experiment.sweep_files import SweepLocation, find_sweep
@@ -189,7 +189,7 @@ def _reader(
 
     def read(node: Node) -> _Run:
         run = planned_run(node, opened.plan.algorithm)
-        if shown and (time := shown.get(continuation_key(node.run, node.source_key))):
+        if time := shown.get(node.key):
             run = replace(run, tags={**run.tags, names.TAG_EARLIER_RESULT: str(time)})
         try:
             if node.key in damaged:

@@ -33,6 +33,8 @@ class Measure:
     tasks with different horizons."""
     maximised: bool = True
     worst: float = np.nan
+    until: float = np.inf
+    """Environment steps at which the final value is read, if the runs have more than planned."""
 
     @property
     def is_rate(self) -> bool:
@@ -49,7 +51,8 @@ class Measure:
         """`mean success over 100,000 steps`."""
         word = names.word_of(self.metric)
         if self.kind == "final":
-            return f"final {word}"
+            at = f" at {self.until:,.0f} steps" if np.isfinite(self.until) else ""
+            return f"final {word}{at}"
         budget = "the budget" if np.isnan(self.horizon) else f"{self.horizon:,.0f} steps"
         return f"mean {word} over {budget}" + ", pretraining included" * (self.kind == "auc_total")
 
@@ -142,7 +145,12 @@ def _score(sweep: Sweep, run: int, measure: Measure) -> float:
     steps, values = sweep.finite(run, measure.metric)
     if measure.kind != "final" and measure.horizon > 0:
         return area_under_curve(steps, values, measure.horizon)
-    return float(values[-1]) if len(values) else np.nan
+    return float(values[_end(steps, measure)]) if len(values) else np.nan
+
+
+def _end(steps: Array, measure: Measure) -> int:
+    """Position of the final value: the first evaluation at `until` or later, or the last one."""
+    return min(int(np.searchsorted(steps, measure.until)), len(steps) - 1)
 
 
 def scores_of(sweep: Sweep, condition: Condition, task: str, measure: Measure) -> Scores:
@@ -174,7 +182,8 @@ def _evaluations(sweep: Sweep, run: int, measure: Measure) -> tuple[Array, float
     steps, values = sweep.finite(run, measure.metric)
     whole = measure.kind != "final" and measure.horizon > 0
     episodes = sweep.final(run, names.EVAL_EPISODES)
-    used = values[steps <= max(measure.horizon, steps[0])] if whole else values[-1:]
+    end = _end(steps, measure)
+    used = values[steps <= max(measure.horizon, steps[0])] if whole else values[end : end + 1]
     return used, np.inf if episodes is None else episodes
 
 

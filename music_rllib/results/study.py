@@ -248,6 +248,17 @@ def _of_plan(
             for task in dict.fromkeys(sweep.runs[run].task for run in runs)
             if task in tasks
         }
+        if plan.metric == "final" and sweep.plans[-1].plan.is_longer(plan):
+            measures = {
+                task: replace(one, until=plan.budget.get(task, np.inf))
+                for task, one in measures.items()
+            }
+        searched = any(names.TAG_PART in sweep.runs[run].tags for run in runs)
+        if not searched and any(
+            one.horizon < plan.budget.get(task, 0) for task, one in measures.items()
+        ):
+            untested[f"{hypothesis.text}: its runs have fewer env_steps than planned"] = scopes
+            continue
         labelled = (_in_words(hypothesis.first), _in_words(hypothesis.second), pairs)
         claims = list(claims_of(sweep, [labelled], measures, plan.margin, plan.seed_count))
         if len(claims) < scopes:

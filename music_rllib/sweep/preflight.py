@@ -53,7 +53,12 @@ def check_environments(plan: Plan, hang_minutes: float | None = None) -> list[st
         BadInputError: A task does not fit; with one line per problem, and the remarks.
     """
     runs = [run for run in plan.settings if run.task.name not in BUILT_IN_TASKS]
-    transferred = {task.name: task for pair in plan.transfers for task in pair}
+    # A handoff has the sizes of its task, whose environment need not be installed here.
+    transferred = {
+        task.name: task
+        for source, task in plan.transfers
+        for task in (task, *([source.task] if source.task and not source.checkpoint else []))
+    }
     if not runs and not transferred:
         return []
     from music_rllib.envs.probe import Question
@@ -76,11 +81,17 @@ def check_environments(plan: Plan, hang_minutes: float | None = None) -> list[st
             problems += [f"environments.{name}: {line}" for line in wrong]
             remarks += [f"environments.{name}: {line}" for line in noteworthy]
     for source, task in plan.transfers:
-        theirs, ours = sizes[source.name], sizes[task.name]
+        assert source.task is not None
+        if source.checkpoint is None:
+            theirs = sizes[source.task.name]
+        else:
+            found = source.checkpoint.manifest.info.spaces
+            theirs = [found.observation_size, found.goal_size, len(found.action_low)]
+        ours = sizes[task.name]
         if theirs and ours and theirs != ours:
             problems.append(
                 f"init_from.task must have observations, goals and actions of the sizes of "
-                f"{task.name}, {tuple(ours)}, got {source.name} with {tuple(theirs)}"
+                f"{task.name}, {tuple(ours)}, got {source.task.name} with {tuple(theirs)}"
             )
     if problems:
         raise BadInputError("\n".join((*problems, *(f"also: {line}" for line in remarks))))

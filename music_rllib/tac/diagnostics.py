@@ -67,8 +67,9 @@ def of_updates(
     if settings.target_bounds is not None:
         low, high = settings.target_bounds
         # The mean of equal atoms may round to a number beside them.
-        rounding = 1e-5 * max(abs(low), abs(high)) if settings.quantiles else 0.0
-        metrics[names.CLIPPED_TARGETS] = _share_at_bounds(target, (low + rounding, high - rounding))
+        share = 1e-5 if settings.quantiles else 0.0
+        bounds = low + share * abs(low), high - share * abs(high)
+        metrics[names.CLIPPED_TARGETS] = _share_at_bounds(target, bounds)
     if "log_density" in observed:
         metrics |= _of_policy(observed["log_density"], q, settings.entropy_form)
         log_std, bounds = observed["log_std"], settings.log_std_bounds

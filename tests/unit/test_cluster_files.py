@@ -561,6 +561,14 @@ def test_patches_of_a_kustomization(
     assert (expected or "") in "".join(problems)
 
 
+def test_a_kustomization_inside_may_have_no_resources(tmp_path: Path) -> None:
+    (tmp_path / "base").mkdir()
+    head = "apiVersion: kustomize.config.k8s.io/v1beta1\nkind: Kustomization\n"
+    (tmp_path / "base/kustomization.yaml").write_text(head + "configMapGenerator: [{name: c}]\n")
+    (tmp_path / "kustomization.yaml").write_text(head + "resources: [base]\n")
+    assert check_file(tmp_path / "kustomization.yaml") == []
+
+
 def test_grafana_finds_its_dashboards_and_prometheus() -> None:
     """At the addresses in the files of `dashboards/`, with the names that compose gives."""
     services = load("compose.yaml")["services"]

@@ -214,6 +214,14 @@ def test_a_target_whose_atoms_are_all_at_a_bound_counts_as_clipped(low: float, h
     assert float(of_updates(observed, settings, 1.0)[names.CLIPPED_TARGETS]) == 1.0
 
 
+def test_a_distant_bound_does_not_widen_the_other_one() -> None:
+    settings = TACSettings(
+        bootstrap="critics", critics=5, quantiles=25, dropped_quantiles=2, target_bounds=(-1e6, 0.0)
+    )
+    observed = {"q_values": torch.zeros(1, 5, 8), "targets": torch.full((1, 8), -5.0)}
+    assert float(of_updates(observed, settings, 1.0)[names.CLIPPED_TARGETS]) == 0.0
+
+
 def test_a_loss_that_is_not_finite_stops_the_run_and_names_network_and_update() -> None:
     built = learner()
     batch = minibatch()

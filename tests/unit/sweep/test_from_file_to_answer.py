@@ -7,20 +7,26 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 
 from music_rllib import names
 from music_rllib.config.problems import ConfigError
+from music_rllib.config.run_settings import RunSettings
+from music_rllib.envs.tasks import Task
+from music_rllib.errors import BadInputError
 from music_rllib.experiment.open_sweep import OpenSweep, continued_runs_text, open_sweep
 from music_rllib.experiment.plan import continuation_key, make_plan, remarks
 from music_rllib.experiment.record import changes_since, keep_record
 from music_rllib.program import main
 from music_rllib.results.analysis_plan import analysis_plan, plans_in, record_plan
 from music_rllib.results.read import read_sweep
-from music_rllib.results.study import study_of, untestable
+from music_rllib.results.study import Study, study_of, untestable
+from music_rllib.store.handoff import Spaces, write_handoff
 from music_rllib.store.history import Report
 from music_rllib.sweep.listeners.state_file import StateFile
+from music_rllib.sweep.preflight import check_environments
 from tests.played_search import publish
 from tests.sweep_files import loaded
 
@@ -110,10 +116,10 @@ def test_plan_with_other_seeds_or_steps_is_no_new_analysis_plan(
     assert len(plans_in(sweep.storage, "s")) == 2
 
 
-def test_points_that_differ_in_settings_of_a_missing_reward_are_equal(tmp_path: Path) -> None:
+def test_points_that_differ_in_settings_of_a_missing_reward_are_named(tmp_path: Path) -> None:
     stage = {"name": "t", "variant": "tac", "grid": {"intrinsic.weight": [0.1, 0.5]}}
-    with pytest.raises(ConfigError, match="must not have two equal points"):
-        loaded(tmp_path, document([stage]))
+    (line,) = remarks(make_plan(loaded(tmp_path, document([stage]))))
+    assert line == "t: 5 runs equal to runs of other points of its grid: trained once"
     stage["grid"] = {"intrinsic": [{"reward": "rnd", "weight": w} for w in (0.1, 0.5)]}
     assert len(make_plan(loaded(tmp_path, document([stage]))).nodes) == 10
 
@@ -189,3 +195,81 @@ def test_more_steps_after_a_result_are_an_exploratory_comparison(tmp_path: Path)
     assert planned.measure.words == "mean success over 2,000 steps"
     assert unplanned.measure.words == "mean success over 4,000 steps"
     assert unplanned.why == "exploratory: over more steps than planned"
+
+
+ASKED: dict[str, Any] = {"hypotheses": ["q = 2 worse than q = 1"]}
+
+
+def over(steps: int, **changes: Any) -> dict[str, Any]:
+    content = document(**changes)
+    content["defaults"]["env_steps"] = steps
+    return content
+
+
+def studied(folder: Path) -> Study:
+    return study_of(read_sweep(str(folder / "results/s")).sweep)
+
+
+def test_a_planned_final_value_is_that_at_the_planned_steps(tmp_path: Path) -> None:
+    analysis = ASKED | {"metric": "final"}
+    first = opened(tmp_path, over(2000, analysis=analysis))
+    ((version,), _) = record_plan(first)
+    play(first, version.recorded_ms + 1)
+    (before,) = studied(tmp_path).planned
+    sweep = opened(tmp_path, over(4000, analysis=analysis))
+    record_plan(sweep)
+    play(sweep, version.recorded_ms + 60_000, before=version.recorded_ms + 1)
+    (planned,) = studied(tmp_path).planned
+    assert float(planned.contrast.difference.value) == float(before.contrast.difference.value)
+    assert planned.measure.words == "final success at 2,000 steps"
+
+
+def test_fewer_steps_than_planned_have_no_verdict(tmp_path: Path) -> None:
+    first = opened(tmp_path, over(4000, analysis=ASKED))
+    ((version,), _) = record_plan(first)
+    play(first, version.recorded_ms + 1)
+    sweep = opened(tmp_path, over(2000, analysis=ASKED))
+    record_plan(sweep)
+    play(sweep, version.recorded_ms + 60_000)
+    study = studied(tmp_path)
+    assert study.planned == ()
+    assert "fewer env_steps than planned" in study.untested[0]
+
+
+def test_a_later_version_still_knows_the_results_of_shorter_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = int(time.time() * 1000)
+    play(opened(tmp_path, over(2000)), now - 5000)
+    sweep = opened(tmp_path, over(4000, analysis=ASKED))
+    record_plan(sweep)
+    play(sweep, now + 60_000, before=now - 5000)
+    monkeypatch.setattr("music_rllib.experiment.plan.ALGORITHM_VERSION", "later")
+    assert studied(tmp_path).planned == ()
+
+
+def test_a_hypothesis_about_a_new_stage_that_continues_shown_runs_is_late(tmp_path: Path) -> None:
+    short = document()["stages"][0]
+    play(opened(tmp_path, document([short])), int(time.time() * 1000) - 5000)
+    stages = [short, short | {"name": "long", "env_steps": 4000}]
+    sweep = opened(tmp_path, document(stages, analysis=ASKED | {"stage": "long"}))
+    assert record_plan(sweep)[1] == tuple(ASKED["hypotheses"])
+
+
+def test_the_environment_of_a_handoff_need_not_be_installed(tmp_path: Path) -> None:
+    lab: dict[str, Any] = {"env_id": "their_lab:Lab-v0", "horizon": 50}
+    run = RunSettings(task=Task(name="Lab", **lab), variant="tac", seed=0)
+    networks = ("policy", "critics", "value", "value_target", "normaliser")
+    weights = {name: {"a": np.zeros(2, np.float32)} for name in networks}
+    source = {"checkpoint": str(tmp_path / "theirs"), "task": "Lab"}
+    stage = {"name": "next", "variant": "music-f", "init_from": source}
+    bounds: dict[str, Any] = {"action_low": (-1.0,) * 4, "action_high": (1.0,) * 4}
+    for size in (25, 10):
+        spaces = Spaces(observation_size=size, goal_size=3, **bounds)
+        write_handoff(tmp_path / "theirs/handoff", weights, run.handoff_info("0" * 20, 1, spaces))
+        plan = make_plan(loaded(tmp_path, document([stage], environments={"Lab": lab})))
+        if size == 25:
+            assert check_environments(plan) == []
+            continue
+        with pytest.raises(BadInputError, match=r"\(25, 3, 4\), got Lab with \(10, 3, 4\)"):
+            check_environments(plan)
