@@ -23,6 +23,7 @@ from music_rllib.results.statistics import (
     number,
     p_text,
     seeds_needed,
+    value_text,
 )
 from music_rllib.results.study import MOST_CONDITIONS, Mean, Study
 
@@ -56,7 +57,7 @@ def answer(sweep: Sweep, study: Study) -> list[str]:
     sentences.append(f"Control: {_control(sweep, study)}.")
     undecided = (Verdict.UNDECIDED, Verdict.NONE)
     alike = _alike(shown)
-    own = (claim for claim in study.claims if _is_alike(claim, alike))
+    own = (claim for claim in study.claims if not alike or _test_of(claim) == _test_of(alike[0]))
     if any(claim.verdict in undecided and not claim.unfinished for claim in own):
         means = [one for one in study.means if _is_alike(one, alike)]
         sentences += filter(None, [power_in_words(alike, means, study.family)])
@@ -194,7 +195,7 @@ def _single_means(means: Sequence[Mean]) -> str:
         start = "No two conditions have results on the same task"
     texts = (
         f"{mean.condition.short_label}{f' on {mean.task}' if len(tasks) > 1 else ''}, "
-        f"{mean.measure.words} {number(mean.estimate.value)} ({mean_interval(mean.estimate)})"
+        f"{mean.measure.words} {value_text(mean.estimate)} ({mean_interval(mean.estimate)})"
         for mean in means[:MOST_CLAIMS]
     )
     return f"{start}: {'; '.join(texts)}."
@@ -210,9 +211,9 @@ def _metric(study: Study, shown: Sequence[Claim]) -> str:
         f"{words} on {' and '.join(of)}" if several else words for words, of in tasks.items()
     )
     # A margin of success rates does not apply to returns.
-    margins = {one.margin for one in _alike(shown) if one.margin is not None}
+    margins = {one.margin for one in shown if _is_alike(one, shown) and one.margin is not None}
     if margins:
-        text += f"; equivalence margin {max(margins):g}"
+        text += f"; equivalence margin {' or '.join(f'{margin:g}' for margin in sorted(margins))}"
     if study.family > 1:
         text += f"; p-values adjusted for {study.family} comparisons (Holm)"
     return f"{text}."
@@ -222,9 +223,14 @@ def _is_alike(one: Claim | Mean, shown: Sequence[Claim]) -> bool:
     return not shown or one.measure.metric == shown[0].measure.metric
 
 
+def _test_of(claim: Claim) -> tuple[str, str, float | None]:
+    """What two claims have in common whose seeds needed are one number."""
+    return claim.measure.metric, claim.measure.kind, claim.margin
+
+
 def _alike(shown: Sequence[Claim]) -> list[Claim]:
-    """The claims about the metric of the first one."""
-    return [claim for claim in shown if _is_alike(claim, shown)]
+    """The claims with the test of the first one."""
+    return [claim for claim in shown if _test_of(claim) == _test_of(shown[0])]
 
 
 def _seeds(sweep: Sweep, study: Study, shown: Sequence[Claim]) -> str:

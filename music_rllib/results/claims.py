@@ -247,6 +247,12 @@ class Claim:
         pairs = frozenset(frozenset(pair) for pair in self.pairs)
         return pairs, self.task, self.measure.kind, self.measure.metric
 
+    def pair_among(self, claims: Sequence[Claim]) -> str:
+        """`q = 1.5 against q = 1`, with the measure if `claims` on the task have several."""
+        pair = f"{self.first} against {self.second}"
+        several = len({one.measure.words for one in claims if one.task == self.task}) > 1
+        return f"{pair}, {self.measure.words}" if several else pair
+
     @property
     def collapses(self) -> float | None:
         """Rate of collapses per seed that the verdict does not exclude; None if it is small."""

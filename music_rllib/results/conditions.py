@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 from music_rllib import names
+from music_rllib.config.schema import Hypothesis, same_value
 from music_rllib.results.data import RunRecord, Sweep
 
 Values = tuple[tuple[str, str], ...]
@@ -251,3 +252,67 @@ def sorting_key(text: str) -> tuple[float, str]:
         return float(text.split(" ")[0]), text
     except ValueError:
         return float("inf"), text
+
+
+# Conditions of a hypothesis -----------------------------------------------------------------------
+
+
+def settings_in_words(side: Mapping[str, str]) -> str:
+    """One side of a hypothesis: `q = 1.5, α = 0.1`."""
+    return ", ".join(f"{_label(name)} = {value}" for name, value in side.items())
+
+
+def _label(name: str) -> str:
+    """The label of a setting or of a part of it: `tac.alpha.value` is α."""
+    return IN_WORDS.get(whole_setting(name), (name, ""))[0]
+
+
+def matching(
+    sweep: Sweep, stages: Mapping[str, StageRuns], side: Mapping[str, str], stage: str
+) -> list[Condition]:
+    """Conditions that may be compared and have all settings of one side of a hypothesis."""
+    settings = dict(side)
+    chosen = stages.get(settings.pop("stage", stage))
+    return [
+        condition
+        for condition in (chosen.compared if chosen else ())
+        if all(_has(sweep.runs[condition.runs[0]], *setting) for setting in settings.items())
+    ]
+
+
+def _has(run: RunRecord, name: str, value: str) -> bool:
+    _, tag = IN_WORDS.get(name, ("", ""))
+    known = [text for text in (run.params.get(name), run.tags.get(tag)) if text is not None]
+    return any(same_value(value, text) for text in known)
+
+
+def pairs_of_hypothesis(
+    first: Sequence[Condition], second: Sequence[Condition], hypothesis: Hypothesis
+) -> list[tuple[Condition, Condition]] | str:
+    """Pairs of conditions that differ only in a hypothesis's settings, or why there are none.
+
+    A single condition on each side is a pair even if other settings differ: each q can have its own
+    α.
+    """
+    for side, settings in ((first, hypothesis.first), (second, hypothesis.second)):
+        if not side:
+            return f"no run of {settings_in_words(settings)} that may be compared has started"
+    if len(first) == len(second) == 1:
+        return [(first[0], second[0])]
+    named = {_label(name) for name in (*hypothesis.first, *hypothesis.second)}
+    firsts, seconds = (
+        {_rest(condition, named): condition for condition in side} for side in (first, second)
+    )
+    pairs = [(one, seconds[rest]) for rest, one in firsts.items() if rest in seconds]
+    if not pairs or len(firsts) < len(first) or len(seconds) < len(second):
+        return (
+            f"{len(first)} and {len(second)} conditions have these settings, and their other "
+            "settings form no pairs: the hypothesis must name more settings"
+        )
+    return pairs
+
+
+def _rest(condition: Condition, named: set[str]) -> Values:
+    """The condition's settings that the hypothesis does not name."""
+    settings = ((ENTROPIC_INDEX, condition.entropic_index), *condition.others)
+    return tuple(pair for pair in settings if pair[0] not in named)

@@ -327,6 +327,15 @@ def interval_text(estimate: Estimate) -> str:
     return f"{low:,.{decimals}f} to {high:,.{decimals}f}"
 
 
+def value_text(estimate: Estimate) -> str:
+    """`0.45`, with as many decimals as its interval."""
+    if not estimate.has_interval:
+        return number(estimate.value)
+    value, *_ = numbers = estimate.numbers
+    decimals = decimals_of(*numbers)
+    return f"{round(value, decimals) + 0.0:,.{decimals}f}"
+
+
 def difference_text(estimate: Estimate) -> str:
     """`+0.12`, with as many decimals as its interval."""
     value, *_ = numbers = estimate.numbers

@@ -16,23 +16,22 @@ from itertools import combinations
 import numpy as np
 
 from music_rllib import names
-from music_rllib.config.schema import Hypothesis, same_value
+from music_rllib.config.schema import Hypothesis
 from music_rllib.experiment.plan import Plan
 from music_rllib.results import statistics as st
 from music_rllib.results.analysis_plan import AnalysisPlan, PlannedHypothesis, PlanVersion
-from music_rllib.results.claims import Claim, Pairs, claims_of, decided, exploratory
+from music_rllib.results.claims import Claim, claims_of, decided, exploratory
 from music_rllib.results.conditions import (
     ALPHA,
-    ENTROPIC_INDEX,
-    IN_WORDS,
     Condition,
     StageRuns,
-    Values,
     find_stages,
+    matching,
+    pairs_of_hypothesis,
+    settings_in_words,
     stages_together,
-    whole_setting,
 )
-from music_rllib.results.data import LastValues, RunRecord, Sweep
+from music_rllib.results.data import LastValues, Sweep
 from music_rllib.results.scores import Measure, Scores, counted, first_result, measure_on, scores_of
 from music_rllib.results.statistics import Estimate
 
@@ -237,8 +236,8 @@ def _of_plan(
         tasks = _tasks_of_all(sweep, key.stages, plan.budget.keys())
         scopes = _scopes(tasks, {sweep.primary_metric(task) for task in tasks})
         sides = (hypothesis.first, hypothesis.second)
-        first, second = (_matching(sweep, stages, side, plan.stage) for side in sides)
-        pairs = _equal_in_the_rest(first, second, hypothesis)
+        first, second = (matching(sweep, stages, side, plan.stage) for side in sides)
+        pairs = pairs_of_hypothesis(first, second, hypothesis)
         if isinstance(pairs, str):
             untested[f"{hypothesis.text}: {pairs}"] = scopes
             continue
@@ -259,7 +258,8 @@ def _of_plan(
         ):
             untested[f"{hypothesis.text}: its runs have fewer env_steps than planned"] = scopes
             continue
-        labelled = (_in_words(hypothesis.first), _in_words(hypothesis.second), pairs)
+        first_label, second_label = map(settings_in_words, sides)
+        labelled = (first_label, second_label, pairs)
         claims = list(claims_of(sweep, [labelled], measures, plan.margin, plan.seed_count))
         if len(claims) < scopes:
             left = sorted(tasks - {claim.task for claim in claims})
@@ -281,13 +281,13 @@ def untestable(planned: Plan, plan: AnalysisPlan) -> Iterator[str]:
         if key.stages & searched:
             continue
         hypothesis = Hypothesis.of(key.text)
-        first, second = (_matching(sweep, stages, side, plan.stage) for side in hypothesis.sides)
+        first, second = (matching(sweep, stages, side, plan.stage) for side in hypothesis.sides)
         for side, settings in zip((first, second), hypothesis.sides, strict=True):
             if not side:
-                yield f"{key.text}: no condition of its own has {_in_words(settings)}"
+                yield f"{key.text}: no condition of its own has {settings_in_words(settings)}"
                 break
         else:
-            pairs = _equal_in_the_rest(first, second, hypothesis)
+            pairs = pairs_of_hypothesis(first, second, hypothesis)
             if isinstance(pairs, str):
                 yield f"{key.text}: {pairs}"
 
@@ -343,70 +343,6 @@ def _means(sweep: Sweep, stage: StageRuns, measures: Mapping[str, Measure]) -> I
                     scores=scores,
                     runs=sum(sweep.runs[run].task == task for run in condition.runs),
                 )
-
-
-# Conditions of a hypothesis -----------------------------------------------------------------------
-
-
-def _in_words(side: Mapping[str, str]) -> str:
-    """One side of a hypothesis: `q = 1.5, α = 0.1`."""
-    return ", ".join(f"{_label(name)} = {value}" for name, value in side.items())
-
-
-def _label(name: str) -> str:
-    """The label of a setting or of a part of it: `tac.alpha.value` is α."""
-    return IN_WORDS.get(whole_setting(name), (name, ""))[0]
-
-
-def _matching(
-    sweep: Sweep, stages: Mapping[str, StageRuns], side: Mapping[str, str], stage: str
-) -> list[Condition]:
-    """Conditions that may be compared and have all settings of one side of a hypothesis."""
-    settings = dict(side)
-    chosen = stages.get(settings.pop("stage", stage))
-    return [
-        condition
-        for condition in (chosen.compared if chosen else ())
-        if all(_has(sweep.runs[condition.runs[0]], *setting) for setting in settings.items())
-    ]
-
-
-def _has(run: RunRecord, name: str, value: str) -> bool:
-    _, tag = IN_WORDS.get(name, ("", ""))
-    known = [text for text in (run.params.get(name), run.tags.get(tag)) if text is not None]
-    return any(same_value(value, text) for text in known)
-
-
-def _equal_in_the_rest(
-    first: Sequence[Condition], second: Sequence[Condition], hypothesis: Hypothesis
-) -> Pairs | str:
-    """Pairs of conditions that differ only in a hypothesis's settings, or why there are none.
-
-    A single condition on each side is a pair even if other settings differ: each q can have its own
-    α.
-    """
-    for side, settings in ((first, hypothesis.first), (second, hypothesis.second)):
-        if not side:
-            return f"no run of {_in_words(settings)} that may be compared has started"
-    if len(first) == len(second) == 1:
-        return [(first[0], second[0])]
-    named = {_label(name) for name in (*hypothesis.first, *hypothesis.second)}
-    firsts, seconds = (
-        {_rest(condition, named): condition for condition in side} for side in (first, second)
-    )
-    pairs = [(one, seconds[rest]) for rest, one in firsts.items() if rest in seconds]
-    if not pairs or len(firsts) < len(first) or len(seconds) < len(second):
-        return (
-            f"{len(first)} and {len(second)} conditions have these settings, and their other "
-            "settings form no pairs: the hypothesis must name more settings"
-        )
-    return pairs
-
-
-def _rest(condition: Condition, named: set[str]) -> Values:
-    """The condition's settings that the hypothesis does not name."""
-    settings = ((ENTROPIC_INDEX, condition.entropic_index), *condition.others)
-    return tuple(pair for pair in settings if pair[0] not in named)
 
 
 # Sensitivity to α ---------------------------------------------------------------------------------

@@ -193,6 +193,7 @@ def study_tables(study: Study) -> list[Table]:
     claims = (*study.planned, *study.unplanned)
     kinds = [found[0].measure.kind_in_words for found in (claims, study.means) if found]
     kinds = kinds or ["area under the curve"]
+    of_area = "The area under the learning curve is the mean over the budget (trapezoidal rule). "
     measures = " or ".join(dict.fromkeys(claim.measure.words for claim in claims))
     comparisons = Table(
         name="comparisons",
@@ -201,7 +202,7 @@ def study_tables(study: Study) -> list[Table]:
         rows=[
             (
                 claim.task,
-                f"{claim.first} against {claim.second}",
+                claim.pair_among(claims),
                 Difference(claim.contrast.difference.value),
                 interval_in_words(claim),
                 p_in_words(claim).removeprefix("p = ") or None,
@@ -230,7 +231,8 @@ def study_tables(study: Study) -> list[Table]:
             )
             for mean in study.means
         ],
-        note="The area under the learning curve is the mean over the budget (trapezoidal rule).",
+        note=f"{of_area if kinds[-1] != 'final value' else ''}A failed run counts with the worst "
+        "value.",
     )
     return [comparisons, means]
 

@@ -201,7 +201,7 @@ def _curves(sweep: Sweep, stage: StageRuns, metrics: Sequence[Metric]) -> Iterat
             yield Drawing(
                 stage=stage.name,
                 title=metric.title,
-                caption=_caption(stage, metric, max(map(len, by_title.values()))),
+                caption=_caption(metric, [*by_title.values()]),
                 subplots=tuple(
                     curve_subplot(metric, title, curves, facets.styles)
                     for title, curves in by_title.items()
@@ -214,14 +214,16 @@ def _curves(sweep: Sweep, stage: StageRuns, metrics: Sequence[Metric]) -> Iterat
             )
 
 
-def _caption(stage: StageRuns, metric: Metric, lines: int) -> str:
-    seeds = len(stage.seeds)
+def _caption(metric: Metric, subplots: Sequence[Sequence[Curve]]) -> str:
+    lines = max(map(len, subplots))
+    counts = {len(curve.values) for curves in subplots for curve in curves}
+    seeds = max(counts)
     if seeds == 1:
         text = "Each line is a single run."
     else:
         band = "" if lines > MOST_BANDS else " with its 95% confidence band"
         text = f"Mean over up to {seeds} seeds{band}."
-        if band and seeds < SHOW_SEEDS_BELOW:
+        if band and any(1 < count < SHOW_SEEDS_BELOW for count in counts):
             text += " Very thin lines are single seeds."
     text += " A line gets thinner where some of its runs have ended."
     return text + (f" Dotted: {metric.target:.0%}." if metric.target is not None else "")
@@ -340,8 +342,7 @@ def _differences(study: Study, stage: str) -> Iterator[Drawing]:
     rows: dict[str, list[tuple[str, Claim]]] = {}
     for claim in study.claims:
         if claim.contrast.difference.has_interval:
-            label = f"{claim.first} against {claim.second}"
-            rows.setdefault(claim.task, []).append((label, claim))
+            rows.setdefault(claim.task, []).append((claim.pair_among(study.claims), claim))
     has_margin = any(claim.margin is not None for found in rows.values() for _, claim in found)
     margin = ", which must lie in the shaded margin for equivalence" if has_margin else ""
     if rows and max(map(len, rows.values())) <= MOST_DIFFERENCES:
@@ -351,8 +352,9 @@ def _differences(study: Study, stage: str) -> Iterator[Drawing]:
             caption="First condition minus second. Thin lines are 95% CIs, thick lines 90% CIs"
             f"{margin}.",
             subplots=tuple(
-                differences_subplot(task, found, f"difference of the {found[0][1].measure.words}")
+                differences_subplot(task, found, f"difference of the {' or '.join(words)}")
                 for task, found in rows.items()
+                for words in [dict.fromkeys(claim.measure.words for _, claim in found)]
             ),
             legend=[],
         )

@@ -13,6 +13,7 @@ from music_rllib.experiment.sweep_files import SweepLocation
 from music_rllib.names import ShortLabels
 from music_rllib.results.analysis import analyse_stage, mixed
 from music_rllib.results.answer import answer, study_data
+from music_rllib.results.conditions import find_stages
 from music_rllib.results.read import SweepRead, read_stored
 from music_rllib.results.study import study_of
 from music_rllib.results.tables import performance_tables, study_tables
@@ -46,9 +47,11 @@ def compare_stage(
     sweep, ranking = read.sweep, ranking_metric(settings, read.sweep)
     shown = metric or (ranking.metric if settings.search else None)
     maximised = not minimize and (ranking.maximised or shown != ranking.metric)
-    study = study_of(sweep, settings.name, metric=metric, maximised=maximised or metric is None)
+    asked = settings.name if stage or metric else None  # otherwise as in the report
+    study = study_of(sweep, asked, metric=metric, maximised=maximised or metric is None)
     short = ShortLabels.of(run.name for run in sweep.runs)
-    environments = [*mixed((run for run in sweep.runs if run.stage == settings.name), short)]
+    compared = {settings.name, *(sweep.runs[run].stage for run in study.runs)}
+    environments = [*mixed((run for run in sweep.runs if run.stage in compared), short)]
     document = {
         "sweep": sweep.name,
         "stage": settings.name,
@@ -60,7 +63,9 @@ def compare_stage(
         "earlier": sweep.earlier,
     }
     earlier = [Text(sweep.earlier)] if sweep.earlier else []
-    final = analyse_stage(sweep, study.stage, shown) if study.stage else None
+    own = next((one for one in find_stages(sweep) if one.name == settings.name), None)
+    of_stage = study.stage or own
+    final = analyse_stage(sweep, of_stage, shown) if of_stage else None
     if final is None or not any(scope.finals for scope in final.scopes):
         if metric is not None:
             _check_metric(read, settings.name, metric)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from rich.console import Console
 from scipy import stats
 
@@ -798,7 +799,9 @@ def test_pairs_are_compared_only_if_all_seeds_are_shared(rng: np.random.Generato
     assert (claim.contrast.paired, claim.contrast.seeds) == (False, (8, 7))
 
 
-def test_runs_are_compared_over_the_planned_or_smallest_budget(rng: np.random.Generator) -> None:
+def test_runs_are_compared_over_the_planned_or_smallest_budget(
+    rng: np.random.Generator,
+) -> None:
     runs = study({"1": 0.3, "1.5": 0.3}, 3, rng)
     planned = with_plan((), plan("q = 1.5 against q = 1", budget={"FetchPush": 4000}), DONE - 1)
     assert study_of(sweep_of(runs, planned)).planned[0].measure.horizon == 4000
@@ -808,7 +811,10 @@ def test_runs_are_compared_over_the_planned_or_smallest_budget(rng: np.random.Ge
         else (record, points)
         for record, points in runs
     ]
-    assert study_of(sweep_of(short, BEFORE)).planned[0].measure.horizon == 5000
+    (claim,) = study_of(sweep_of(short)).unplanned
+    assert claim.measure.horizon == 5000
+    found = study_of(sweep_of(short, BEFORE))
+    assert (found.planned, len(found.untested)) == ((), 1)
 
 
 def test_seeds_needed_are_unknown_at_a_bound(rng: np.random.Generator) -> None:
@@ -1314,3 +1320,70 @@ def test_success_on_another_task_does_not_count_in_auc_total(tmp_path: Path) -> 
     found, values = sweep.series(1, names.EVAL_SUCCESS)
     assert (found.tolist(), values.tolist()) == ([4000, 6000, 8000], [0.1] * 3)
     assert sweep.runs[1].budget == 8000
+
+
+def second_stage(rng: np.random.Generator, stage: str) -> list[tuple[RunRecord, Points]]:
+    """Runs that end after a plan was extended by their hypothesis."""
+    runs = cells(rng, 6, ("1", 0.3), ("1.5", 0.5), stage=stage)
+    return [
+        (record, points._replace(times=[DONE + 100] * len(points.times))) for record, points in runs
+    ]
+
+
+def test_seeds_needed_are_for_the_margin_of_their_hypothesis(rng: np.random.Generator) -> None:
+    train = cells(rng, 6, ("1", 0.30), ("1.5", 0.33))
+    later = plan("stage = second, q = 1.5 against stage = second, q = 1", margin=0.2)
+    versions = with_plan(with_plan((), plan("q = 1.5 against q = 1"), DONE - 1), later, DONE + 1)
+    sweep = sweep_of([*train, *second_stage(rng, "second")], versions)
+    text = " ".join(answer(sweep, study_of(sweep)))
+    assert "equivalence margin 0.05 or 0.2" in text
+    assert "a difference of 0.05 needs" in text
+
+
+def test_each_comparison_has_its_own_measure(rng: np.random.Generator) -> None:
+    first = plan("q = 1.5 against q = 1", budget={"FetchPush": 6000})
+    later = plan("stage = long, q = 1.5 against stage = long, q = 1", budget={"FetchPush": BUDGET})
+    versions = with_plan(with_plan((), first, DONE - 1), later, DONE + 1)
+    train = cells(rng, 6, ("1", 0.3), ("1.5", 0.4))
+    found = study_of(sweep_of([*train, *second_stage(rng, "long")], versions))
+    figure = next(one for one in study_drawings(found) if one.title == "Differences")
+    axes = Figure().subplots()
+    figure.subplots[0].draw(axes)
+    label = axes.get_xlabel().replace("\n", " ")
+    short, whole = "mean success over 6,000 steps", "mean success over 10,000 steps"
+    assert label == f"difference of the {short} or {whole}"
+    rows = [str(row[1]) for row in study_tables(found)[0].rows]
+    assert rows[0].endswith(f", {short}")
+    assert rows[1].endswith(f", {whole}")
+
+
+def test_a_single_mean_lies_in_its_shown_interval(rng: np.random.Generator) -> None:
+    metrics = [names.EVAL_EPISODES] * len(STEPS) + [names.EVAL_SUCCESS] * len(STEPS)
+    runs = []
+    for seed, rate in enumerate([0.002, 0.004, 0.003, 0.005, 0.004]):
+        record, _ = run({"tac.entropic_index": "1"}, seed, 0.0, rng)
+        values = [50.0] * len(STEPS) + [rate] * len(STEPS)
+        runs.append((record, Points(metrics, [*STEPS, *STEPS], [DONE] * 2 * len(STEPS), values)))
+    sweep = sweep_of(runs)
+    assert "steps 0.004 (95% CI 0.001 to 0.009)" in answer(sweep, study_of(sweep))[1]
+
+
+def test_a_caption_counts_the_seeds_of_a_line(rng: np.random.Generator) -> None:
+    her = cells(rng, 5, ("1", 0.3), stage="her")
+    tuned = [
+        run({"tac.entropic_index": "1"}, seed, 0.4, rng, stage="tuned", part=part)
+        for part, seeds in (("trial0", range(2)), ("final0", range(1000, 1005)))
+        for seed in seeds
+    ]
+    sweep = sweep_of([*her, *tuned])
+    (drawing,) = drawings_of_stages(sweep, find_stages(sweep))
+    assert drawing.caption.startswith("Mean over up to 5 seeds")
+    assert "Very thin lines are single seeds." in drawing.caption
+
+
+def test_means_of_final_values_name_failed_runs(rng: np.random.Generator) -> None:
+    final = with_plan((), plan("q = 1.5 against q = 1", metric="final"), DONE - 1)
+    runs = cells(rng, 6, ("1", 0.3), ("1.5", 0.4))
+    runs[0] = (replace(runs[0][0], status="FAILED"), runs[0][1])
+    _, means = study_tables(study_of(sweep_of(runs, final)))
+    assert means.note == "A failed run counts with the worst value."

@@ -46,6 +46,7 @@ from music_rllib.experiment.sweep_files import as_json
 from music_rllib.names import ShortLabels
 from music_rllib.program import main
 from music_rllib.results.analysis import analyse
+from music_rllib.results.analysis_plan import record_plan
 from music_rllib.results.answer import answer, claim_rows, mean_rows
 from music_rllib.results.read import read_sweep
 from music_rllib.results.study import study_of
@@ -1229,6 +1230,44 @@ def test_compare_shows_the_stage_of_a_recorded_plan_as_the_report_does(
     reported = study_of(read_sweep(f"{storage}/mine").sweep).stage
     assert reported is not None
     assert program("compare", f"{storage}/mine", "--json").document["stage"] == reported.name
+
+
+def test_a_comparison_of_stages_names_different_environments(
+    storage: str, tmp_path: Path, program: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    her: dict[str, Any] = {"name": "her", "variant": "tac"}
+    stages = [her, her | {"name": "other", "tac": {"lr": 0.01}}]
+    analysis = {"hypotheses": ["stage = other against stage = her"]}
+    sweep = opened(storage, tmp_path, stages=stages, analysis=analysis)
+    record_plan(sweep)
+    publish = sweep.store.publish
+    with StateFile(sweep) as state_file:
+        for node in sweep.plan.nodes:
+            environment = {"mujoco": "3.8.0" if node.stage == "her" else "3.8.1"}
+            in_it = functools.partial(publish, environment=environment)
+            monkeypatch.setattr(sweep.store, "publish", in_it)
+            finish(sweep, state_file, node, 0.3, tmp_path / "made")
+        state_file.end("finished")
+    (line,) = program("compare", f"{storage}/mine", "--json").document["environments"]
+    assert "2 versions of its environment" in line
+
+
+def test_compare_and_the_report_agree_without_the_tasks_reward(
+    storage: str, tmp_path: Path, program: Program
+) -> None:
+    stages = [{"name": "explore", "variant": "music-u", "grid": {"tac.entropic_index": [1.0, 2.0]}}]
+    sweep = opened(storage, tmp_path, seeds=list(range(5)), stages=stages)
+    with StateFile(sweep) as state_file:
+        for node in sweep.plan.nodes:
+            finish(sweep, state_file, node, 0.1, tmp_path / "made")
+        state_file.end("finished")
+    logged = read_sweep(f"{storage}/mine").sweep
+    document = program("compare", f"{storage}/mine", "--json").document
+    assert document["answer"] == answer(logged, study_of(logged))
+    assert document["comparisons"] == []
+    assert "Final values" in program("compare", f"{storage}/mine").output
+    asked = program("compare", f"{storage}/mine", "--stage", "explore", "--json").document
+    assert len(asked["comparisons"]) == 1
 
 
 def test_stop_leaves_a_driver_alone_that_writes_its_report(
