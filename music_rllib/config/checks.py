@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from music_rllib import names
 from music_rllib.config.layers import PlacedPoint, is_in
-from music_rllib.config.problems import ConfigError, Findings, KeyPath, shown, unknown
+from music_rllib.config.problems import ConfigError, Findings, KeyPath, same, shown, unknown
 from music_rllib.config.run_settings import VARIANTS, RunSettings
 from music_rllib.config.schema import Analysis, Hypothesis, Point, Stage, same_value
 from music_rllib.config.search import SearchSettings, of_stage
-from music_rllib.config.space import Choice
+from music_rllib.config.space import Choice, FloatRange
 from music_rllib.config.tac_settings import setting_text
 from music_rllib.envs.tasks import closest
 from music_rllib.redaction import flat_params
@@ -149,6 +149,28 @@ def _check_values(
             value = shown(example[name])
             in_search.add((section, name), f"must not have two equal values, got {value} again")
         found.append(settings)
+    if len(findings.problems) == problems_before:
+        _check_inside(search, above, resolve_at, findings)
+
+
+def _check_inside(
+    search: SearchSettings,
+    above: Stage | None,
+    resolve_at: Callable[[PlacedPoint, Findings], Point],
+    findings: Findings,
+) -> None:
+    """A range of real numbers can have valid ends, and only invalid values between them."""
+    for path, example in search.examples():
+        section, name = path[0], str(path[1])
+        dimension = search.space[name] if section == "space" else None
+        if not isinstance(dimension, FloatRange) or example[name] != dimension.ends()[0]:
+            continue
+        if (inside := dimension.inside()) is not None:
+            values = {**example, name: inside}
+            point = {key: (("search", "space", key), value) for key, value in values.items()}
+            resolve_at({key: at for key, at in point.items() if ":" not in key}, findings)
+            if above is not None:
+                _runs_above(above, point, findings)
 
 
 def _runs_above(above: Stage, point: PlacedPoint, findings: Findings) -> Mapping[str, Any] | None:
@@ -170,7 +192,13 @@ def _check_points_to_evaluate(search: SearchSettings, findings: Findings) -> Non
 
     The sampler chooses omitted values, so a setting that depends on them could be dropped.
     """
+    whole: list[Mapping[str, Any]] = []
     for position, point in enumerate(search.points_to_evaluate):
+        if all(at.applies(point) == (name in point) for name, at in search.space.items()):
+            if any(same(point, one) for one in whole):
+                rule = f"must not repeat, got {shown(point)} again"
+                findings.add(("points_to_evaluate", position), rule)
+            whole.append(point)
         for name, value in point.items():
             dimension, path = search.space.get(name), ("points_to_evaluate", position, name)
             if dimension is None:
@@ -184,8 +212,8 @@ def _check_points_to_evaluate(search: SearchSettings, findings: Findings) -> Non
 
 # Hypotheses ---------------------------------------------------------------------------------------
 
-Settings = Mapping[str, str]
-"""Dotted settings of a run to their values as text; a schedule in words, and its parts."""
+Settings = Mapping[str, Sequence[str]]
+"""Dotted settings of a run to their values as text: in words, and in full if that differs."""
 
 
 def check_analysis(
@@ -249,11 +277,14 @@ def _compared_runs(stage: Stage) -> list[Settings]:
 
 def _settings(run: RunSettings) -> Settings:
     """The settings of a run as tracking has them: params, and schedules in words."""
-    return flat_params(run.model_dump(mode="json")) | {
+    params = flat_params(run.model_dump(mode="json"))
+    words = {
         "tac.entropic_index": setting_text(run.tac.entropic_index),
         "tac.alpha": setting_text(run.tac.alpha),
         "music.mi_reward_weight": setting_text(run.music.mi_reward_weight),
     }
+    both = [{name: (text,) for name, text in texts.items()} for texts in (words, params)]
+    return {name: (*both[0].get(name, ()), *both[1].get(name, ())) for name in params | words}
 
 
 def _broken_rule(stage: Stage, condition: Mapping[str, str]) -> str | None:
@@ -276,8 +307,8 @@ def _broken_rule(stage: Stage, condition: Mapping[str, str]) -> str | None:
             varied += [key for key in (search.compare if search else ()) if ":" not in key]
             settings = ", ".join(dict.fromkeys([*varied, *space])) or "nothing"
             return f"must name settings, of which {stage.name} varies {settings}, got {name!r}"
-        if not any(same_value(text, value) for value in values):
-            has = ", ".join(values)
+        if not any(same_value(text, one) for value in values for one in value):
+            has = ", ".join(dict.fromkeys(value[0] for value in values))
             return f"must name values that {stage.name} has ({name}: {has}), got {text}"
     if not any(_has(run, fixed) for run in runs):
         pairs = ", ".join(f"{name} = {text}" for name, text in fixed.items())
@@ -321,4 +352,6 @@ def _broken_final(stage: Stage, condition: Mapping[str, str]) -> str | None:
 
 
 def _has(run: Settings, condition: Mapping[str, str]) -> bool:
-    return all(name in run and same_value(text, run[name]) for name, text in condition.items())
+    return all(
+        any(same_value(text, one) for one in run.get(name, ())) for name, text in condition.items()
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Annotated, Any, Self
 
@@ -98,6 +99,13 @@ class FloatRange(_Range):
     """A real number."""
 
     bounds: tuple[float, float] = Field(alias="float")
+
+    def inside(self) -> float | None:
+        """A value between the ends, which a setting of whole numbers refuses; None without one."""
+        if self.size is not None:
+            return self._at(1) if self.size > 2 else None
+        low, high = self.bounds
+        return float(f"{low + (high - low) / math.pi:.12g}")
 
 
 class IntRange(_Range):

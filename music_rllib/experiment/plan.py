@@ -7,6 +7,7 @@ are its runs of different keys, and each is computed once.
 from __future__ import annotations
 
 import itertools
+import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -332,7 +333,11 @@ def short(value: Any, setting: str) -> str:
     if isinstance(value, list | tuple):
         items = [short(inner, "") for inner in value]
         return "x".join(items) if setting.endswith("hidden_sizes") else f"[{','.join(items)}]"
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    if not isinstance(value, float):
+        return str(value)
+    # As short as possible, so that labels of different values differ; 0.1 + 0.2 is 0.3.
+    texts = (f"{value:.{digits}g}" for digits in (6, 12))
+    return next((text for text in texts if math.isclose(float(text), value)), repr(value))
 
 
 def node_key(run: RunSettings, source: str | None, algorithm: str | None = None) -> str:

@@ -62,6 +62,8 @@ _METRICS = {
 """Columns of the table of metrics."""
 
 _PLACES = re.compile(r"^( *(?:storage|tracking_uri): (['\"]?))(.+)(\2)$", re.MULTILINE)
+_PATHS = re.compile(r"^( *(?:- )*(?:[\w.-]+: )?(['\"]?))((?:file://)?/.+)(\2)$", re.MULTILINE)
+"""Values that are absolute paths, such as those of `env_kwargs`."""
 _FOLDERS = re.compile(r"(?:file://|(?<![\w:/.~]))/(?:[^\s/'\"]+/)+")
 """The folders above a file in a message."""
 _LOCAL = re.compile(r"(sqlite(?:\+\w+)?:///)/(?:.*/)?([^/]+/[^/]+)|(?:file://)?/(?:.*/)?([^/]+)/*")
@@ -91,7 +93,8 @@ def write_archive(sweep: Sweep, folder: Path, file_format: Format = "parquet") -
     """
     tables = [f"{one}.{kind}" for one in ("runs", "metrics") for kind in get_args(Format)]
     own = (CONFIG, _HEADER, *tables, _SEARCHES, _PLANS)
-    if not is_archive(folder) and (found := [name for name in own if (folder / name).exists()]):
+    is_ours = is_archive(folder) and _is_header(folder / _HEADER)
+    if not is_ours and (found := [name for name in own if os.path.lexists(folder / name)]):
         raise ReportError(
             f"--export must be a new folder or that of an earlier export, got {folder}, which has "
             f"{', '.join(found)}"
@@ -100,9 +103,11 @@ def write_archive(sweep: Sweep, folder: Path, file_format: Format = "parquet") -
     header |= {name: getattr(sweep, name) for name in _OWN_FIELDS}
     header["source"] = _without_folders(sweep.source)
     if sweep.config is not None:
-        header["config"] = _PLACES.sub(
-            lambda found: found[1] + _without_folders(found[3]) + found[4], sweep.config
-        )
+        header["config"] = sweep.config
+        for values in (_PLACES, _PATHS):
+            header["config"] = values.sub(
+                lambda found: found[1] + _without_folders(found[3]) + found[4], header["config"]
+            )
     try:
         folder.mkdir(parents=True, exist_ok=True)
         # Written to a temporary folder first: a full disk must not destroy an earlier export.
@@ -155,6 +160,15 @@ def read_archive(folder: Path) -> Sweep:
     return Sweep(**own, runs=records, history=history, searches=found, plans=plans)
 
 
+def _is_header(file: Path) -> bool:
+    """Whether an export, perhaps an interrupted one, wrote this file, which it replaces at once."""
+    try:
+        header = _read_json(file)
+    except (OSError, ValueError):
+        return False
+    return isinstance(header, dict) and {"version", "format", "source"} <= header.keys()
+
+
 class _Header(BaseModel):
     """Content of `sweep.json`."""
 
@@ -189,7 +203,7 @@ def _runs_table(runs: Sequence[RunRecord]) -> pa.Table:
         | {name: getattr(run, name) for name in _RUN_FIELDS}
         | {f"tag.{name}": value for name, value in run.tags.items()}
         | ({f"tag.{TAG_FAILURE}": _FOLDERS.sub("", run.failure)} if run.failure else {})
-        | {f"param.{name}": value for name, value in run.params.items()}
+        | {f"param.{name}": _FOLDERS.sub("", value) for name, value in run.params.items()}
         for number, run in enumerate(runs)
     ]
     others = sorted({name for row in rows for name in row} - _RUNS.keys())

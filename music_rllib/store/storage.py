@@ -135,10 +135,10 @@ class StorageFolder:
             self.request(lambda: self.filesystem.delete_dir(f"{self.path}/{name}".rstrip("/")))
 
     def folders(self) -> list[str]:
-        return [info.base_name for info in self.entries() if not info.is_file]
+        return [name for info in self.entries() if not info.is_file for name in _name(info)]
 
     def files(self) -> list[str]:
-        return [info.base_name for info in self.entries() if info.is_file]
+        return [name for info in self.entries() if info.is_file for name in _name(info)]
 
     def entries(self, *, recursive: bool = False) -> list[pafs.FileInfo]:
         """What is in this folder; `recursive`: and below it."""
@@ -161,6 +161,12 @@ class StorageFolder:
             return
         with ThreadPoolExecutor(REQUESTS) as pool:
             yield from pool.map(read, keys)
+
+
+def _name(info: pafs.FileInfo) -> Iterator[str]:
+    """The name of an entry; none if it is not UTF-8, which no name of this package is."""
+    with contextlib.suppress(UnicodeDecodeError):
+        yield info.base_name
 
 
 def open_storage(uri: str) -> StorageFolder:
@@ -254,7 +260,9 @@ def storage_and_name(uri: str) -> tuple[str, str]:
 def sweep_folder(storage: str, name: str) -> Path:
     """Local folder of a sweep's own files: in the storage, or in the home folder for a bucket."""
     if is_remote(storage):
-        bucket = hashlib.sha256(storage.encode()).hexdigest()[:12]
+        above, mark, options = storage.partition("?")  # with or without a slash at the end
+        place = f"{above.rstrip('/')}{mark}{options}"
+        bucket = hashlib.sha256(place.encode()).hexdigest()[:12]
         return Path.home() / ".music_rllib" / bucket / name
     return Path(unquote(storage.removeprefix("file://")) if "://" in storage else storage) / name
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -29,7 +30,7 @@ from music_rllib.store.files import write_atomically
 from music_rllib.store.handoff import MANIFEST as HANDOFF_FILE
 from music_rllib.store.storage import StorageError, is_remote
 
-CHOSEN = "chosen.json"
+CHOSEN, RUN = "chosen.json", "run.yaml"
 
 
 def export_best(location: SweepLocation, stage_name: str | None, output: Path) -> dict[str, Any]:
@@ -153,6 +154,7 @@ def _export(opened: OpenSweep, key: str, folder: Path, chosen: Mapping[str, Any]
         folder.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(dir=folder) as temporary:
             opened.store.fetch(key, Path(temporary))
+            _refuse_other_files(folder, Path(temporary))
             for part in Path(temporary).iterdir():
                 target = folder / part.name
                 if target.is_dir():
@@ -165,10 +167,22 @@ def _export(opened: OpenSweep, key: str, folder: Path, chosen: Mapping[str, Any]
                 part.replace(target)
         document = yaml.dump(sweep_of_run(opened, key, folder), Dumper=Dumper, sort_keys=False)
         write_atomically(folder / CHOSEN, sweep_files.as_json(chosen).encode())
-        write_atomically(folder / "run.yaml", document.encode())
+        write_atomically(folder / RUN, document.encode())
     except OSError as error:
         place = error.filename or folder
         raise StorageError(f"{place} must be writable: {error.strerror}") from error
+
+
+def _refuse_other_files(folder: Path, new: Path) -> None:
+    """Check that no file of the user would be replaced by those in `new`, or by our own two."""
+    if (folder / CHOSEN).is_file() or (folder / "handoff" / HANDOFF_FILE).is_file():
+        return  # an earlier export, perhaps an interrupted one
+    files = sorted({*(one.name for one in new.iterdir() if one.is_file()), CHOSEN, RUN})
+    if found := [name for name in files if os.path.lexists(folder / name)]:
+        raise BadInputError(
+            f"--output must be a new folder or one of `best`, got {folder}, which has "
+            f"{', '.join(found)}"
+        )
 
 
 def _remove_others(output: Path, policies: Sequence[Mapping[str, Any]]) -> None:
@@ -211,7 +225,7 @@ def sweep_of_run(sweep: OpenSweep, key: str, folder: Path) -> dict[str, Any]:
         if name not in BUILT_IN_TASKS
     }
     return {
-        "name": f"{sweep.config.name}-best"[:80],
+        "name": f"{sweep.config.name[:75]}-best",
         "tasks": [chain[-1].run.task.name],
         "seeds": [chain[-1].run.seed],
         **({"environments": environments} if environments else {}),

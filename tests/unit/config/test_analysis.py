@@ -205,3 +205,33 @@ def test_two_spellings_of_a_value_are_one_condition(sides: tuple[str, str]) -> N
 
 def test_stage_names_are_compared_as_text() -> None:
     assert Hypothesis.of("stage = 1 against stage = 1.0").relation == "against"
+
+
+def stage(**settings: Any) -> dict[str, Any]:
+    train = {"name": "train", "variant": "tac", **settings}
+    return {"name": "g", "tasks": ["FetchReach"], "seeds": [0], "stages": [train]}
+
+
+@pytest.mark.parametrize("value", ["0.1234567", "0.123457"])
+def test_a_hypothesis_can_name_a_value_as_the_file_has_it(value: str, tmp_path: Path) -> None:
+    analysis = {"hypotheses": [f"alpha = {value} better than alpha = 0.2"]}
+    loaded(tmp_path, {**stage(grid={"tac.alpha": [0.1234567, 0.2]}), "analysis": analysis})
+
+
+@pytest.mark.parametrize("more", [{}, {"step": 0.5}])
+def test_real_numbers_are_no_range_of_a_whole_number(more: dict[str, Any], tmp_path: Path) -> None:
+    search = {"space": {"tac.batch_size": {"float": [64, 512], **more}}, "trials": 2}
+    with pytest.raises(ConfigError, match="batch_size must be a whole number"):
+        loaded(tmp_path, stage(search=search))
+    search["space"] = {"tac.batch_size": {"float": [64, 512], "step": 64}}
+    loaded(tmp_path, stage(search=search))
+
+
+def test_a_point_is_given_once(tmp_path: Path) -> None:
+    space: dict[str, Any] = {"tac.alpha": {"float": [0.1, 0.5]}}
+    points = [{"tac.alpha": 0.2}, {"tac.alpha": 0.2}]
+    search = {"space": space, "trials": 4, "points_to_evaluate": points}
+    with pytest.raises(ConfigError, match=r"points_to_evaluate\[1\] must not repeat"):
+        loaded(tmp_path, stage(search=search))
+    space["tac.tau"] = {"float": [0.01, 0.5]}  # the sampler chooses another rest each time
+    loaded(tmp_path, stage(search=search))

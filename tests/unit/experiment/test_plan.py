@@ -261,3 +261,12 @@ def test_a_search_two_stages_after_a_grid_is_refused(tmp_path: Path) -> None:
     finetune = {k: v for k, v in FINETUNE.items() if k != "grid"}
     with pytest.raises(ConfigError, match=r"must lead to stages without a grid .* got 'pretrain'"):
         plan(tmp_path, stages=[pretrain, finetune, far])
+
+
+def test_labels_of_close_values_differ(tmp_path: Path) -> None:
+    values = [0.1234567, 0.1234568, 0.1, 1e-05, 1.0, 0.1 + 0.2]
+    stage = {"name": "train", "variant": "tac", "grid": {"tac.tau": values}}
+    document = {"name": "g", "tasks": ["FetchReach"], "seeds": [0], "stages": [stage]}
+    labels = [node.label for node in make_plan(loaded(tmp_path, document)).nodes]
+    shown = [label.split("=")[1].partition("/")[0] for label in labels]
+    assert shown == ["0.1234567", "0.1234568", "0.1", "1e-05", "1", "0.3"]

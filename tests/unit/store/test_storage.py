@@ -24,8 +24,10 @@ from music_rllib.store.storage import (
     below,
     check_answers,
     check_storage,
+    open_storage,
     resolve_storage,
     storage_and_name,
+    sweep_folder,
 )
 from music_rllib.sweep.driver import DEFAULT_CONFIG
 
@@ -198,3 +200,15 @@ def test_a_bucket_that_refuses_is_not_asked_again(
     with pytest.raises(OSError, match="503"):
         bucket.read("x")
     assert len(said) == 1, "it waits for a minute"
+
+
+@pytest.mark.parametrize("storage", ["s3://b/x/", "s3://b/x/?region=y", "s3://b/", "s3://b/x"])
+def test_a_slash_at_the_end_of_a_bucket_names_the_same_folder(storage: str) -> None:
+    found, name = storage_and_name(below(storage, "s"))
+    assert sweep_folder(found, name) == sweep_folder(storage, "s")
+
+
+def test_a_folder_whose_name_is_not_utf8_is_no_sweep(tmp_path: Path) -> None:
+    (tmp_path / os.fsdecode(b"\xdcbungen")).mkdir()
+    (tmp_path / "s").mkdir()
+    assert open_storage(str(tmp_path)).folders() == ["s"]
