@@ -26,6 +26,7 @@ from music_rllib.config.document import SCHEMA, shipped_presets
 from music_rllib.config.layers import all_settings
 from music_rllib.config.run_settings import (
     LAYER_KEYS,
+    SECTIONS,
     VARIANTS,
     Evaluation,
     ReplaySettings,
@@ -59,7 +60,7 @@ from music_rllib.config.tac_settings import (
 from music_rllib.envs.features import Mirror, Translation
 from music_rllib.envs.tasks import BUILT_IN_TASKS, Task
 from music_rllib.intrinsic.settings import IntrinsicSettings, MusicSettings
-from music_rllib.schedules import Linear, Measured, Piecewise
+from music_rllib.schedules import Linear, Measured, Piecewise, StrictModel
 
 TARGET = Path(__file__).with_name("configuration.md")
 
@@ -423,8 +424,10 @@ def json_schema() -> dict[str, Any]:
     settings: dict[str, Any] = {}
     for name in LAYER_KEYS:
         field = RunSettings.model_fields[name]
-        settings[name] = (field.rebuild_annotation(), field.get_default())
-    layer = create_model("Settings", **settings)
+        kind = field.rebuild_annotation()
+        # A group with nothing below it, `tac:`, has no value.
+        settings[name] = (kind | None if name in SECTIONS else kind, field.get_default())
+    layer = create_model("Settings", __base__=StrictModel, **settings)
     stage = create_model(
         "Stage",
         __base__=StageHeader,
@@ -436,8 +439,8 @@ def json_schema() -> dict[str, Any]:
         __base__=Header,
         seeds=(int | tuple[int, ...], (0,)),
         preset=(str | None, None),
-        environments=(dict[str, definition], {}),
-        defaults=(layer, layer()),
+        environments=(dict[str, definition] | None, None),
+        defaults=(layer | None, layer()),
         stages=(tuple[stage, ...], ...),
     )
     document: dict[str, Any] = sweep.model_json_schema(schema_generator=_Described)

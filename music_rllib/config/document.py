@@ -268,7 +268,8 @@ def lay_overrides(document: Document, overrides: Mapping[str, Any]) -> None:
         else _parts(key, "environments", _environments(document))
         for key in left
     }
-    for key in sorted(left, key=lambda key: _turn(places[key])):
+    # A whole mapping comes before its parts, which it would replace.
+    for key in sorted(left, key=lambda key: (_turn(places[key]), len(places[key]))):
         place, value = places[key], left[key]
         if place[0] in LAYER_KEYS:
             for stage in _stages(document):

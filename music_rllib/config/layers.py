@@ -151,7 +151,7 @@ def merge(
             twice = ", ".join(name for name in value if f"{dotted}.{name}" in point)
             rule = f"must not hold a field that varies by itself too, got {twice}"
             problems.append(Problem(once, rule))
-        elif dotted.partition(".")[0] not in LAYER_KEYS:
+        elif dotted.partition(".")[0] not in (SECTIONS if "." in dotted else LAYER_KEYS):
             known = (*all_settings(), "seeds", "tasks")
             problems.append(Problem(once, unknown(dotted, known)))
         else:

@@ -84,6 +84,9 @@ def unknown(key: str, known: Iterable[str]) -> str:
     """The rule that an unknown key breaks, with a suggestion from the `known` (dotted) keys."""
     names = list(known)
     field = key.rpartition(".")[2]
+    if key in names:  # a dotted setting where groups are written
+        group = key.rpartition(".")[0]
+        return f"is not a known setting here (did you mean '{group}: {{{field}: ...}}'?)"
     field = SYMBOLS.get(field, field)
     meant = next((name for name in names if field in (name, name.rpartition(".")[2])), None)
     hint = closest(key, names) if meant is None else f" (did you mean {meant!r}?)"

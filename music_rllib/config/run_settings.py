@@ -345,11 +345,11 @@ class RunSettings(StrictModel):
                 f"env_steps must be > tac.{setting} ({self.tac.steps_before_updates}), "
                 f"or nothing is learned, got {self.env_steps}"
             )
-        trajectories = self.num_envs * self.task.horizon
-        if self.replay.capacity < trajectories:
+        steps = min(self.tac.max_episode_steps or self.task.horizon, self.task.horizon)
+        if self.replay.capacity < self.num_envs * steps:
             raise ValueError(
                 "replay.capacity must hold one episode of every sub-environment "
-                f"({self.num_envs} x {self.task.horizon} steps), got {self.replay.capacity}"
+                f"({self.num_envs} x {steps} steps), got {self.replay.capacity}"
             )
         return self
 

@@ -168,7 +168,7 @@ def _check_defaults(defaults: Mapping[str, Any], findings: Findings) -> None:
 
 def _header(raw: dict[str, Any], findings: Findings) -> StageHeader | None:
     known = (*StageHeader.model_fields, *all_settings())
-    for key in raw.keys() - set(known):
+    for key in raw.keys() - {*StageHeader.model_fields, *LAYER_KEYS}:
         findings.add((key,), unknown(key, known))
     values = {key: value for key, value in raw.items() if key in StageHeader.model_fields}
     if isinstance(values.get("init_from"), str):
@@ -183,7 +183,7 @@ def _header(raw: dict[str, Any], findings: Findings) -> StageHeader | None:
 def _check_per_task(header: StageHeader, tasks: tuple[Task, ...], findings: Findings) -> None:
     known = [task.name for task in tasks]
     for name, settings in header.per_task.items():
-        if name not in known:
+        if known and name not in known:  # otherwise the stage's tasks are a problem already
             rule = f"is not a task of this stage ({', '.join(known)})"
             findings.add(("per_task", name), rule)
         for key in settings.keys() - set(LAYER_KEYS):

@@ -268,7 +268,8 @@ class TACSettings(StrictModel):
     """Weight of the policy's mean squared action, in [-1, 1], in its loss (original MUSIC: 1.0).
     Higher values make actions smaller, possibly too small to push an object."""
     max_episode_steps: int | None = Field(None, gt=0)
-    """Steps after which episodes are truncated; required if the environment has no time limit."""
+    """Steps after which episodes are truncated; required if the environment has no time limit. In a
+    sweep, episodes have at most the task's `horizon`, also if this is larger."""
 
     @property
     def critic_count(self) -> int:

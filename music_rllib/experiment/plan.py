@@ -272,7 +272,7 @@ class Plan:
 
 def remarks(plan: Plan) -> list[str]:
     """A line for each property of a valid plan that may be unintended."""
-    return [*_shared_runs(plan), *_unbounded_alphas(plan)]
+    return [*_shared_runs(plan), *_idle_indices(plan), *_unbounded_alphas(plan)]
 
 
 def _shared_runs(plan: Plan) -> Iterator[str]:
@@ -306,6 +306,13 @@ def _shared_text(where: str, count: int, first: str) -> str:
         f"{where}: {in_runs(count)} equal to runs of {first}: trained once, and counted for "
         f"{first} only in reports, comparisons and hypotheses"
     )
+
+
+def _idle_indices(plan: Plan) -> Iterator[str]:
+    """A line if runs differ in q without an entropy in their losses: they train the same."""
+    count = sum("tac.entropic_index" in run.values and run.run.tac.alpha == 0 for run in plan.runs)
+    if count:
+        yield f"{in_runs(count)} of a grid over q with alpha 0, where q has no effect on training"
 
 
 def _unbounded_alphas(plan: Plan) -> Iterator[str]:
