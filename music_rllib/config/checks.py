@@ -7,7 +7,7 @@ from typing import Any
 
 from music_rllib import names
 from music_rllib.config.layers import PlacedPoint, is_in
-from music_rllib.config.problems import ConfigError, Findings, KeyPath, same, shown, unknown
+from music_rllib.config.problems import ConfigError, Findings, KeyPath, shown, unknown
 from music_rllib.config.run_settings import VARIANTS, RunSettings
 from music_rllib.config.schema import Analysis, Hypothesis, Point, Stage, same_value
 from music_rllib.config.search import SearchSettings, of_stage
@@ -192,13 +192,7 @@ def _check_points_to_evaluate(search: SearchSettings, findings: Findings) -> Non
 
     The sampler chooses omitted values, so a setting that depends on them could be dropped.
     """
-    whole: list[Mapping[str, Any]] = []
     for position, point in enumerate(search.points_to_evaluate):
-        if all(at.applies(point) == (name in point) for name, at in search.space.items()):
-            if any(same(point, one) for one in whole):
-                rule = f"must not repeat, got {shown(point)} again"
-                findings.add(("points_to_evaluate", position), rule)
-            whole.append(point)
         for name, value in point.items():
             dimension, path = search.space.get(name), ("points_to_evaluate", position, name)
             if dimension is None:

@@ -7,7 +7,6 @@ are its runs of different keys, and each is computed once.
 from __future__ import annotations
 
 import itertools
-import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -342,9 +341,9 @@ def short(value: Any, setting: str) -> str:
         return "x".join(items) if setting.endswith("hidden_sizes") else f"[{','.join(items)}]"
     if not isinstance(value, float):
         return str(value)
-    # As short as possible, so that labels of different values differ; 0.1 + 0.2 is 0.3.
-    texts = (f"{value:.{digits}g}" for digits in (6, 12))
-    return next((text for text in texts if math.isclose(float(text), value)), repr(value))
+    # A value of a file in full, so that labels differ; computed ones such as 0.1 + 0.2 in short.
+    text = f"{value:.12g}"
+    return text if float(text) == value else f"{value:g}"
 
 
 def node_key(run: RunSettings, source: str | None, algorithm: str | None = None) -> str:

@@ -160,6 +160,11 @@ def read_archive(folder: Path) -> Sweep:
     return Sweep(**own, runs=records, history=history, searches=found, plans=plans)
 
 
+def _shown(param: str, value: str) -> str:
+    """A param, of the task without folders; others tell conditions apart."""
+    return _FOLDERS.sub("", value) if param.startswith("task.") else value
+
+
 def _is_header(file: Path) -> bool:
     """Whether an export, perhaps an interrupted one, wrote this file, which it replaces at once."""
     try:
@@ -203,7 +208,7 @@ def _runs_table(runs: Sequence[RunRecord]) -> pa.Table:
         | {name: getattr(run, name) for name in _RUN_FIELDS}
         | {f"tag.{name}": value for name, value in run.tags.items()}
         | ({f"tag.{TAG_FAILURE}": _FOLDERS.sub("", run.failure)} if run.failure else {})
-        | {f"param.{name}": _FOLDERS.sub("", value) for name, value in run.params.items()}
+        | {f"param.{name}": _shown(name, value) for name, value in run.params.items()}
         for number, run in enumerate(runs)
     ]
     others = sorted({name for row in rows for name in row} - _RUNS.keys())

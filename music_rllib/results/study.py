@@ -141,7 +141,12 @@ def study_of(
         longer = [one for one in now if one in in_time and latest.plan.is_longer(in_time[one].plan)]
         why = "exploratory: over more steps than planned"
         of_longer = _of_plan(sweep, stages, latest, longer, untested)
-        unplanned += [replace(claim, why=why) for claim in of_longer]
+        same = [(claim.subject, claim.measure.words) for claim in planned]
+        unplanned += [
+            replace(claim, why=why)
+            for claim in of_longer
+            if (claim.subject, claim.measure.words) not in same
+        ]
     means: list[Mean] = []
     if chosen is not None:
         kind, margin = "auc", None
@@ -247,11 +252,13 @@ def _of_plan(
             for task in dict.fromkeys(sweep.runs[run].task for run in runs)
             if task in tasks
         }
-        if plan.metric == "final" and sweep.plans[-1].plan.is_longer(plan):
-            measures = {
-                task: replace(one, until=plan.budget.get(task, np.inf))
-                for task, one in measures.items()
-            }
+        if plan.metric == "final":
+            of_plan = [run for one in plan.stages & stages.keys() for run in _runs(stages[one])]
+            for task, one in measures.items():
+                planned, least = plan.budget.get(task, np.inf), sweep.least_budget(task, runs)
+                # A plan has the steps of its shortest runs only.
+                if planned < least == sweep.least_budget(task, of_plan):
+                    measures[task] = replace(one, until=planned)
         searched = any(names.TAG_PART in sweep.runs[run].tags for run in runs)
         if not searched and any(
             one.horizon < plan.budget.get(task, 0) for task, one in measures.items()

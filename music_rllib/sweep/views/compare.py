@@ -41,14 +41,19 @@ def compare_stage(
     metrics |= {names.EVAL_EPISODES, *names.ENTROPIES, *filter(None, [metric])}
     metrics |= {one.search.objectives[0].metric for one in stages.values() if one.search}
     read = read_stored(location, metrics=metrics)
-    recorded = read.sweep.plans[-1].plan.stage if read.sweep.plans else ""
-    settings = stages.get(recorded) if stage is None else None
-    settings = settings or config.stage(stage)
-    sweep, ranking = read.sweep, ranking_metric(settings, read.sweep)
+    sweep, chosen = read.sweep, [stage]
+    in_report = study_of(sweep) if stage is None else None
+    if in_report is not None:  # several stages side by side have no settings
+        chosen = [in_report.stage.name if in_report.stage else None]
+        chosen += [one.plan.stage for one in sweep.plans[-1:]]
+    settings = config.stage(next((name for name in chosen if name in stages), stage))
+    ranking = ranking_metric(settings, sweep)
     shown = metric or (ranking.metric if settings.search else None)
     maximised = not minimize and (ranking.maximised or shown != ranking.metric)
-    asked = settings.name if stage or metric else None  # otherwise as in the report
-    study = study_of(sweep, asked, metric=metric, maximised=maximised or metric is None)
+    study = in_report if metric is None else None
+    if study is None:
+        higher = maximised or metric is None
+        study = study_of(sweep, settings.name, metric=metric, maximised=higher)
     short = ShortLabels.of(run.name for run in sweep.runs)
     compared = {settings.name, *(sweep.runs[run].stage for run in study.runs)}
     environments = [*mixed((run for run in sweep.runs if run.stage in compared), short)]

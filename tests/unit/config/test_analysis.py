@@ -225,13 +225,3 @@ def test_real_numbers_are_no_range_of_a_whole_number(more: dict[str, Any], tmp_p
         loaded(tmp_path, stage(search=search))
     search["space"] = {"tac.batch_size": {"float": [64, 512], "step": 64}}
     loaded(tmp_path, stage(search=search))
-
-
-def test_a_point_is_given_once(tmp_path: Path) -> None:
-    space: dict[str, Any] = {"tac.alpha": {"float": [0.1, 0.5]}}
-    points = [{"tac.alpha": 0.2}, {"tac.alpha": 0.2}]
-    search = {"space": space, "trials": 4, "points_to_evaluate": points}
-    with pytest.raises(ConfigError, match=r"points_to_evaluate\[1\] must not repeat"):
-        loaded(tmp_path, stage(search=search))
-    space["tac.tau"] = {"float": [0.01, 0.5]}  # the sampler chooses another rest each time
-    loaded(tmp_path, stage(search=search))

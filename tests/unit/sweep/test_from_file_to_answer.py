@@ -21,12 +21,14 @@ from music_rllib.experiment.plan import continuation_key, make_plan, remarks
 from music_rllib.experiment.record import changes_since, keep_record
 from music_rllib.program import main
 from music_rllib.results.analysis_plan import analysis_plan, plans_in, record_plan
+from music_rllib.results.archive import read_archive, write_archive
 from music_rllib.results.read import read_sweep
 from music_rllib.results.study import Study, study_of, untestable
 from music_rllib.store.handoff import Spaces, write_handoff
 from music_rllib.store.history import Report
 from music_rllib.sweep.listeners.state_file import StateFile
 from music_rllib.sweep.preflight import check_environments
+from music_rllib.sweep.views.compare import compare_stage
 from tests.played_search import publish
 from tests.sweep_files import loaded
 
@@ -273,3 +275,56 @@ def test_the_environment_of_a_handoff_need_not_be_installed(tmp_path: Path) -> N
             continue
         with pytest.raises(BadInputError, match=r"\(25, 3, 4\), got Lab with \(10, 3, 4\)"):
             check_environments(plan)
+
+
+def test_an_export_tells_conditions_apart_by_their_paths(tmp_path: Path) -> None:
+    paths = ["/data/a/enc.pt", "/data/b/enc.pt"]
+    reward = {"reward": "my_rewards:Surprise"}
+    grid = {"intrinsic.settings.weights": paths}
+    stage = {"name": "t", "variant": "tac", "intrinsic": reward, "grid": grid}
+    text = " better than ".join(f"intrinsic.settings.weights = {one}" for one in paths)
+    sweep = opened(tmp_path, document([stage], analysis={"hypotheses": [text]}))
+    ((version,), _) = record_plan(sweep)
+    play(sweep, version.recorded_ms + 1)
+    write_archive(read_sweep(str(tmp_path / "results/s")).sweep, tmp_path / "out")
+    found = study_of(read_archive(tmp_path / "out"))
+    assert (len(found.means), len(found.planned), found.untested) == (2, 1, ())
+
+
+def test_a_new_margin_does_not_move_a_planned_final_value(tmp_path: Path) -> None:
+    analysis = ASKED | {"metric": "final"}
+    first = opened(tmp_path, over(2000, analysis=analysis))
+    ((version,), _) = record_plan(first)
+    play(first, version.recorded_ms + 1)
+    sweep = opened(tmp_path, over(4000, analysis=analysis | {"margin": 0.2}))
+    record_plan(sweep)
+    play(sweep, version.recorded_ms + 60_000, before=version.recorded_ms + 1)
+    (planned,) = studied(tmp_path).planned
+    assert planned.measure.words == "final success at 2,000 steps"
+
+
+def test_a_planned_final_value_of_an_unchanged_stage_stays(tmp_path: Path) -> None:
+    short: dict[str, Any] = document()["stages"][0] | {"name": "short", "tac": {"lr": 0.002}}
+    stages = [short, {**document()["stages"][0], "name": "long", "env_steps": 4000}]
+    texts = [f"stage = {s}, q = 2 worse than stage = {s}, q = 1" for s in ("short", "long")]
+    analysis: dict[str, Any] = {"hypotheses": texts, "metric": "final"}
+    first = opened(tmp_path, document(stages, analysis=analysis))
+    ((version,), _) = record_plan(first)
+    play(first, version.recorded_ms + 1)
+    before = studied(tmp_path).planned[1]
+    fewer = analysis | {"hypotheses": texts[1:]}
+    record_plan(opened(tmp_path, document(stages, analysis=fewer)))
+    study = studied(tmp_path)
+    assert study.planned[1].measure == before.measure
+    assert study.unplanned == ()
+
+
+def test_compare_names_the_stage_that_it_shows(tmp_path: Path) -> None:
+    search = {"space": {"tac.lr": {"float": [0.001, 0.01]}}, "trials": 2}
+    search |= {"objective": {"metric": "evaluation/episode_return"}}
+    tuned = {"name": "tuned", "variant": "tac", "search": search}
+    sweep = opened(tmp_path, document([*document()["stages"], tuned]))
+    play(sweep, 1)
+    found, _ = compare_stage(sweep.location, None, None, minimize=False)
+    assert len(found["comparisons"]) == 1
+    assert (found["stage"], found["metric"]) == ("her", "evaluation/success_rate")
