@@ -76,7 +76,10 @@ def fingerprint_of(
         return found | _files_of_arguments(env_kwargs)
     register_robotics()
     walk = _Walk(_relative_texts(env_kwargs))
-    found = _fingerprint_of_modules([*_modules_of(env_id), *map(_imported, modules)], walk)
+    roots = [*_modules_of(env_id), *map(_imported, modules)]
+    for text in _relative_texts(env_kwargs):
+        walk.add_environment(text)
+    found = _fingerprint_of_modules(roots, walk)
     return dict(sorted((found | _files_of_arguments(env_kwargs, walk.hashed)).items()))
 
 
@@ -196,9 +199,20 @@ class _Walk:
         for node in ast.walk(tree):
             if isinstance(node, ast.Constant) and isinstance(node.value, str):
                 self._strings.add(node.value)
+                self.add_environment(node.value)
         above = name.rpartition(".")[0]
         for other in (*([above] if above else []), *_imports(ast.walk(tree), _package(name, file))):
             self.visit(other)
+
+    def add_environment(self, text: str) -> None:
+        """Add the environment that a string names, such as one that a function wraps."""
+        if _OWN_ID.fullmatch(text):
+            self.visit(text.partition(":")[0])
+        spec = gym.registry.get(text)
+        if spec and str(spec.entry_point).startswith(("gymnasium.", "gymnasium_robotics.")):
+            with contextlib.suppress(Exception):  # a package that it needs may not be installed
+                for module in _modules_of(text):
+                    self.visit(module, is_root=True)
 
     def files(self) -> dict[str, str]:
         """Hashes of models in the folders of the sources, and of files that these name."""
@@ -226,6 +240,8 @@ class _Walk:
         return found_now
 
 
+_OWN_ID = re.compile(r"[A-Za-z_][\w.]*:[\w./-]+-v\d+")
+"""An id with its module in front, such as `lab_env:Lab-v0`."""
 _FILE_ATTRIBUTE = re.compile(r"""\b(?:file|filename)\s*=\s*["']([^"']+)["']""")
 
 

@@ -37,8 +37,8 @@ Floats = NDArray[np.float32]
 
 def compute_reward_of(env: Env) -> GoalReward | None:
     """The environment's `compute_reward` as a function of goals, unchecked; None without one."""
-    compute = getattr(env.unwrapped, "compute_reward", None)
-    if compute is None or not isinstance(env.observation_space, spaces.Dict):
+    compute = _outermost(env, "compute_reward")
+    if compute is None:
         return None
 
     def reward(achieved: NDArray[np.float32], desired: NDArray[np.float32]) -> NDArray[Any]:
@@ -151,17 +151,17 @@ def _distance(observation: Any) -> float:
     return float(np.linalg.norm(achieved - desired)) or 1.0
 
 
-def _compute_terminated(env: Env) -> Any:
-    """The outermost `compute_terminated` of a goal environment and its wrappers; None without."""
+def _outermost(env: Env, name: str) -> Any:
+    """The outermost function `name` of a goal environment and its wrappers; None without."""
     if isinstance(env.observation_space, spaces.Dict):
         with contextlib.suppress(AttributeError):
-            return env.get_wrapper_attr("compute_terminated")
+            return env.get_wrapper_attr(name)
     return None
 
 
 def compute_terminated_of(env: Env) -> GoalEnd | None:
     """The environment's `compute_terminated`, called for one row after another; None without it."""
-    compute = _compute_terminated(env)
+    compute = _outermost(env, "compute_terminated")
     if compute is None:
         return None
 
@@ -195,7 +195,7 @@ def goal_end_of(env: Env, seed: int = 0) -> GoalEnd | None:
             "replay.hindsight_k must be 0 if compute_terminated does not compute a flag from two "
             f"goals: with {name_of(env)}, it raises {one_line(error)}"
         ) from error
-    compute = _compute_terminated(env)
+    compute = _outermost(env, "compute_terminated")
     if not expected.any() and compute.__module__.startswith("gymnasium_robotics."):
         return None
 

@@ -49,7 +49,9 @@ class PlayedValues:
     def __init__(self, space: gym.Space[Any], observation: int, goal: int) -> None:
         self._space, self._sizes = space, (observation, goal)
         self._types: set[str] = set()
-        self._observation, self._reward = Rounding(), Rounding()
+        self._seen = {name: Rounding() for name in GOAL_KEYS[: 2 if goal else 1]}
+        """Of the observation and the desired goal, which the networks get."""
+        self._reward = Rounding()
         self._holds = np.ones((observation, goal), bool)
         self._goals: list[NDArray[np.float32]] = []
         self._lowest, self._highest = np.inf, -np.inf
@@ -67,7 +69,8 @@ class PlayedValues:
             returned, declared = np.asarray(values[name]).dtype, np.dtype(parts[name].dtype)
             if returned.kind != declared.kind:
                 self._types.add(f"{name} has type {returned}, its space declares {declared}")
-        self._observation.see(values[GOAL_KEYS[0]])
+        for name in self._seen:
+            self._seen[name].see(values[name])
 
     def reward(self, value: Any) -> None:
         """Take in the valid reward of a step."""
@@ -101,9 +104,10 @@ class PlayedValues:
         """Other findings, one line each."""
         lines = [f"{line}; the networks get float32" for line in sorted(self._types)]
         lines += [
-            f"observation[{entry}] changes too little for its size: float32, which the networks "
+            f"{name}[{entry}] changes too little for its size: float32, which the networks "
             "get, does not keep its changes; give it relative to an origin that is near"
-            for entry in self._observation.lost(_STILL)[:1]
+            for name, values in self._seen.items()
+            for entry in values.lost(_STILL)[:1]
         ]
         if len(self._reward.lost()):
             lines.append(

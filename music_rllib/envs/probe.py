@@ -7,7 +7,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
@@ -60,6 +60,13 @@ class Question(BaseModel):
     hindsight: tuple[str, ...] = ()
     intrinsic: bool = False
     rewards: tuple[str, ...] = ()
+
+
+class Played(NamedTuple):
+    """An episode, and whether its last step terminated or truncated it."""
+
+    episode: Episode
+    ends: tuple[bool, bool]
 
 
 class RefusedError(Exception):
@@ -264,7 +271,7 @@ class Probe:
 
     # -- episodes -------------------------------------------------------------------------
 
-    def _play(self, env: Env, seed: int, *, actions: int, steps: int | None = None) -> Episode:
+    def _play(self, env: Env, seed: int, *, actions: int, steps: int | None = None) -> Played:
         """Play an episode of random actions, which `actions` seeds."""
         observation = self._reset(env, seed)
         recording = Recording(
@@ -276,7 +283,7 @@ class Probe:
         )
         rng, end = np.random.default_rng(actions), time.monotonic() + EPISODE_SECONDS
         space = check_action_space(env.action_space)
-        ended = terminated = False
+        ended = terminated = truncated = False
         last = min(steps or self._layout.horizon, self._layout.horizon)
         try:
             recording.see(observation)
@@ -296,20 +303,22 @@ class Probe:
         except BadNumberError as error:
             raise RefusedError(first_line(error)) from None
         self._values.end(episode.frames)
-        return episode
+        return Played(episode, (terminated, truncated))
 
-    def _differs(self, env: Env, first: Episode, seed: int) -> int | None:
+    def _differs(self, env: Env, played: Played, seed: int) -> int | None:
         """Play an episode again; the step from which on it differs."""
-        again = self._play(env, seed, actions=0, steps=min(REPEATED_STEPS, len(first)))
+        first = played.episode
+        again, ends = self._play(env, seed, actions=0, steps=min(REPEATED_STEPS, len(first)))
         steps = min(len(again), len(first))
         differs = (again.frames[: steps + 1] != first.frames[: steps + 1]).any(axis=1)
-        if differs.any() or (again.rewards[:steps] != first.rewards[:steps]).any():
-            return int(np.argmax(differs)) if differs.any() else steps
-        return None
+        differs[1:] |= again.rewards[:steps] != first.rewards[:steps]
+        if again.successes is not None and first.successes is not None:
+            differs[1:] |= again.successes[:steps] != first.successes[:steps]
+        # It must end where the first one did. One that is cut after a time has not ended.
+        differs[-1] |= ends != (played.ends if steps == len(first) else (False, False))
+        return int(np.argmax(differs)) if differs.any() else None
 
-    def _repeat(
-        self, env: Env, first: Episode, seed: int, name: str = "the second time it"
-    ) -> bool:
+    def _repeat(self, env: Env, first: Played, seed: int, name: str = "the second time it") -> bool:
         """Whether an episode is the same again; a remark otherwise."""
         if (at := self._differs(env, first, seed)) is None:
             return True
@@ -320,7 +329,7 @@ class Probe:
         )
         return False
 
-    def _check_second(self, env: Env, first: Episode, seed_range: tuple[int, int]) -> None:
+    def _check_second(self, env: Env, first: Played, seed_range: tuple[int, int]) -> None:
         """Make a second environment in this process, as training does, and play both."""
         task, (smallest, largest) = self._task, seed_range
         try:

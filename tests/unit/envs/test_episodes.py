@@ -304,6 +304,21 @@ def test_calls_of_the_checks_are_watched_like_those_of_training() -> None:
     assert all(watched)
 
 
+def test_the_reward_of_a_wrapper_counts() -> None:
+    class Tight(gym.Wrapper[Any, Any, Any, Any]):
+        def compute_reward(self, achieved: Floats, desired: Floats, info: Any) -> Any:
+            return -(np.linalg.norm(achieved - desired, axis=-1) > 0.01).astype(np.float32)
+
+        def step(self, action: Any) -> Any:
+            seen, _, *ends, info = self.env.step(action)
+            goals = seen["achieved_goal"], seen["desired_goal"]
+            return seen, float(self.compute_reward(*goals, {})), *ends, info
+
+    reward = goal_reward_of(Tight(make_env("FetchPush-v4")))
+    near = np.array([[0.03, 0.0, 0.0]], np.float32)
+    assert reward(0.0 * near, near).tolist() == [-1.0]
+
+
 def test_the_end_of_a_wrapper_counts() -> None:
     class EndsAtGoal(gym.Wrapper[Any, Any, Any, Any]):
         def compute_terminated(self, achieved: Floats, desired: Floats, info: Any) -> Any:

@@ -226,3 +226,20 @@ def test_a_file_beside_the_module_counts_wherever_the_sweep_is_started(
     level.write_text("2")
     now_found = fingerprint_of("lab.envs:Lab-v0", {"file": name})
     assert differences(found[0], now_found) == [f"lab/{name} changed"]
+
+
+def test_an_environment_inside_another_counts(folder: Path) -> None:
+    """Its id is in a string: an own one, or one of Gymnasium with its simulator."""
+    inner = folder / "lab_inner.py"
+    inner.write_text("import gymnasium as gym\ngym.register('Inner-v0', gym.Env)\n")
+    (folder / "lab_late.py").write_text(
+        "import gymnasium as gym\n"
+        "make = lambda: gym.Wrapper(gym.make('lab_inner:Inner-v0'))\n"
+        "other = lambda: gym.make('Pusher-v5')\n"
+        "gym.register('Lab-v0', make)\n"
+    )
+    before = fingerprint_of("lab_late:Lab-v0", {})
+    assert "package mujoco" in before
+    inner.write_text(inner.read_text() + "# changed\n")
+    after = fingerprint_of("lab_late:Lab-v0", {})
+    assert differences(before, after) == ["lab_inner.py changed"]

@@ -375,6 +375,21 @@ class NoAction(Sound):
     action_space = spaces.Box(-1, 1, (0,), np.float32)
 
 
+class SharedClock(Sound):
+    """The steps of an episode are counted in the class."""
+
+    clock = 0
+
+    def reset(self, **options: Any) -> Any:
+        SharedClock.clock = 0
+        return super().reset(**options)
+
+    def step(self, action: Any) -> Any:
+        SharedClock.clock += 1
+        seen, reward, terminated, _, info = super().step(action)
+        return seen, reward, terminated, SharedClock.clock >= 20, info
+
+
 class OneReward(Sound):
     def compute_reward(self, achieved: Any, desired: Any, info: Any) -> Any:
         return np.mean(super().compute_reward(achieved, desired, info))
@@ -385,6 +400,7 @@ class OneReward(Sound):
     [
         (OnlyOne, "need several environments in one process: the second time, make must not raise"),
         (Shared, "environments in one process must not share state, as several are trained on"),
+        (SharedClock, "environments in one process must not share state"),
         (NewRadius, "rewards of the same goals change from episode to episode"),
         (NewBounds, "spaces must stay the same after reset(), got Box(-1.0, 1.0, (2,), float32)"),
         (LateSpaces, "must have action_space and observation_space before reset()"),
@@ -444,6 +460,37 @@ class TorchGenerator(Sound):
         return super().step(action + 0.1 * torch.randn(2).numpy())
 
 
+class Longer(Sound):
+    """Each episode is one step longer."""
+
+    episodes = 0
+
+    def reset(self, **options: Any) -> Any:
+        self.episodes, self.steps = self.episodes + 1, 0
+        return super().reset(**options)
+
+    def step(self, action: Any) -> Any:
+        self.steps += 1
+        seen, reward, _, truncated, info = super().step(action)
+        return seen, reward, self.steps == self.episodes, truncated, info
+
+
+class Lucky(Sound):
+    """Success depends on the episodes before."""
+
+    calls = 0
+
+    def step(self, action: Any) -> Any:
+        self.calls += 1
+        *rest, _ = super().step(action)
+        return *rest, {"is_success": self.calls % 7 == 0}
+
+
+class FarGoals(Sound):
+    def seen(self) -> Any:
+        return {name: value + 5.4e6 * ("goal" in name) for name, value in super().seen().items()}
+
+
 @pytest.mark.parametrize(
     ("kind", "remark"),
     [
@@ -453,6 +500,9 @@ class TorchGenerator(Sound):
         (HoldsDense, "observation[1] holds desired_goal[1] or its distance"),
         (FarAway, "observation[0] changes too little for its size: float32"),
         (Drawn, "a second environment's differed from step 1 on"),
+        (Longer, "the second time it differed from step 2 on"),
+        (Lucky, "the second time it differed from step 2 on"),
+        (FarGoals, "desired_goal[0] changes too little for its size: float32"),
         (
             changed(lambda env, seen, reward, *rest: (seen, 1e9 - abs(env.at[0]), *rest)),
             "rewards change too little for their size: float32",
