@@ -5,6 +5,7 @@ Validation does not stop at the first problem, so that a file can be corrected i
 
 from __future__ import annotations
 
+import functools
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -84,9 +85,10 @@ def unknown(key: str, known: Iterable[str]) -> str:
     """The rule that an unknown key breaks, with a suggestion from the `known` (dotted) keys."""
     names = list(known)
     field = key.rpartition(".")[2]
-    if key in names:  # a dotted setting where groups are written
-        group = key.rpartition(".")[0]
-        return f"is not a known setting here (did you mean '{group}: {{{field}: ...}}'?)"
+    if "." in key and key in names:  # a dotted setting where groups are written
+        top, *rest = key.split(".")
+        inner = functools.reduce(lambda text, part: f"{{{part}: {text}}}", reversed(rest), "...")
+        return f"is not a known setting here (did you mean '{top}: {inner}'?)"
     field = SYMBOLS.get(field, field)
     meant = next((name for name in names if field in (name, name.rpartition(".")[2])), None)
     hint = closest(key, names) if meant is None else f" (did you mean {meant!r}?)"

@@ -72,7 +72,9 @@ def fingerprint_of(
     """
     if env_id in {task.env_id for task in BUILT_IN_TASKS.values()}:
         found = {_PACKAGE + name: _version(name) for name in ("gymnasium-robotics", "mujoco")}
-        found |= _fingerprint_of_modules(map(_imported, modules)) if modules else {}
+        if modules:
+            register_robotics()  # their strings may name its ids
+            found |= _fingerprint_of_modules(map(_imported, modules))
         return found | _files_of_arguments(env_kwargs)
     register_robotics()
     walk = _Walk(_relative_texts(env_kwargs))

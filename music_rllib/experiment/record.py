@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from typing import Any, NamedTuple
 
+from music_rllib import names
 from music_rllib.config.run_settings import RunSettings
 from music_rllib.config.schema import Stage, SweepConfig
 from music_rllib.errors import BadInputError, indented
@@ -130,8 +131,8 @@ def _earlier_runs(sweep: OpenSweep) -> list[dict[str, Any]]:
     return [{name: one[name] for name in kept if name in one} for one in earlier]
 
 
-def results_of_other_budgets(sweep: OpenSweep) -> dict[str, int]:
-    """By key of a planned node: the time in ms of the first result of runs that begin like it.
+def results_of_other_budgets(sweep: OpenSweep) -> dict[str, dict[str, str]]:
+    """By key of a planned node: tags about the first result of runs that begin like it.
 
     These are runs of an earlier plan or of another stage with other `env_steps`. A hypothesis that
     is newer than their results is not planned.
@@ -147,11 +148,19 @@ def results_of_other_budgets(sweep: OpenSweep) -> dict[str, int]:
     counts, ours = Counter(known.values()), {*own.values()}
     shared = [key for key, of in known.items() if counts[of] > 1 and of in ours]
     times: dict[str, int] = {}
+    steps: dict[str, int] = {}
     for key in sweep.store.finished(shared) if shared else ():
-        with contextlib.suppress(StorageError):  # the time of a damaged run is not known
-            time = sweep.store.history(key)[-1].timestamp_ms
-            times[known[key]] = min(times.get(known[key], time), time)
-    return {key: times[of] for key, of in own.items() if of in times}
+        with contextlib.suppress(StorageError):  # the result of a damaged run is not known
+            of, last = known[key], sweep.store.history(key)[-1]
+            times[of] = min(times.get(of, last.timestamp_ms), last.timestamp_ms)
+            if key not in own:
+                steps[of] = min(steps.get(of, last.env_steps), last.env_steps)
+    return {
+        key: {names.TAG_EARLIER_RESULT: str(times[of])}
+        | ({names.TAG_EARLIER_STEPS: str(steps[of])} if of in steps else {})
+        for key, of in own.items()
+        if of in times
+    }
 
 
 def earlier_text(location: SweepLocation) -> str | None:

@@ -129,10 +129,10 @@ class AnalysisPlan(StrictModel, strict=True):
     def has_same_test(self, other: AnalysisPlan) -> bool:
         return (self.metric, self.margin) == (other.metric, other.margin)
 
-    def is_longer(self, other: AnalysisPlan) -> bool:
-        """Whether this is the same test over more steps of a task."""
-        more = (steps > other.budget.get(task, steps) for task, steps in self.budget.items())
-        return self.has_same_test(other) and any(more)
+    def extends(self, other: AnalysisPlan) -> bool:
+        """Whether this is the same test over at least the steps of the other plan."""
+        same = (self.budget.get(task, steps) >= steps for task, steps in other.budget.items())
+        return self.has_same_test(other) and all(same)
 
     def asks_as(self, other: AnalysisPlan) -> bool:
         """Whether the `analysis` section is the same; seeds and budgets may differ."""

@@ -189,8 +189,8 @@ def _reader(
 
     def read(node: Node) -> _Run:
         run = planned_run(node, opened.plan.algorithm)
-        if time := shown.get(node.key):
-            run = replace(run, tags={**run.tags, names.TAG_EARLIER_RESULT: str(time)})
+        if node.key in shown:
+            run = replace(run, tags={**run.tags, **shown[node.key]})
         try:
             if node.key in damaged:
                 raise damaged[node.key]

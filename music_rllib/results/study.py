@@ -122,7 +122,7 @@ def study_of(
     planned: list[Claim] = []
     for version in sweep.plans:
         own = [key for key, planned_by in in_time.items() if planned_by is version]
-        planned += _of_plan(sweep, stages, version, own, untested)
+        planned += _of_plan(sweep, stages, version, own, untested, keeps_steps=True)
     without_test = sum(untested.values())
     unplanned: list[Claim] = []
     late: list[PlannedHypothesis] = []
@@ -138,14 +138,17 @@ def study_of(
         of_late = _of_plan(sweep, stages, latest, late, untested)
         unplanned += [replace(claim, why=why) for claim in of_late]
         unplanned += _of_plan(sweep, stages, latest, again, untested)
-        longer = [one for one in now if one in in_time and latest.plan.is_longer(in_time[one].plan)]
+        longer = [
+            one
+            for one in now
+            if in_time.get(one, latest) is not latest and latest.plan.extends(in_time[one].plan)
+        ]
         why = "exploratory: over more steps than planned"
-        of_longer = _of_plan(sweep, stages, latest, longer, untested)
-        same = [(claim.subject, claim.measure.words) for claim in planned]
+        known = [_result(claim) for claim in planned]
         unplanned += [
             replace(claim, why=why)
-            for claim in of_longer
-            if (claim.subject, claim.measure.words) not in same
+            for claim in _of_plan(sweep, stages, latest, longer, untested)
+            if _result(claim) not in known
         ]
     means: list[Mean] = []
     if chosen is not None:
@@ -223,16 +226,24 @@ def _scopes(tasks: Collection[str], metrics: Collection[str]) -> int:
     return len(tasks) + (len(tasks) > 1 and names.EVAL_RATES.issuperset(metrics))
 
 
+def _result(claim: Claim) -> tuple[object, ...]:
+    """What a claim compares, with the difference: words about several tasks do not name steps."""
+    return claim.subject, claim.measure.words, str(claim.contrast.difference.value)
+
+
 def _of_plan(
     sweep: Sweep,
     stages: Mapping[str, StageRuns],
     version: PlanVersion,
     hypotheses: Sequence[PlannedHypothesis],
     untested: dict[str, int],
+    *,
+    keeps_steps: bool = False,
 ) -> Iterator[Claim]:
     """The undecided claims of some of a plan's hypotheses.
 
-    Fills `untested` with reasons and the number of comparisons that can't be tested.
+    Fills `untested` with reasons and the number of comparisons that can't be tested. With
+    `keeps_steps`, final values are those at the steps of the first results.
     """
     plan = version.plan
     sweep = counted(sweep, plan.metric) if hypotheses else sweep
@@ -252,13 +263,12 @@ def _of_plan(
             for task in dict.fromkeys(sweep.runs[run].task for run in runs)
             if task in tasks
         }
-        if plan.metric == "final":
-            of_plan = [run for one in plan.stages & stages.keys() for run in _runs(stages[one])]
+        if plan.metric == "final" and keeps_steps:
             for task, one in measures.items():
-                planned, least = plan.budget.get(task, np.inf), sweep.least_budget(task, runs)
-                # A plan has the steps of its shortest runs only.
-                if planned < least == sweep.least_budget(task, of_plan):
-                    measures[task] = replace(one, until=planned)
+                own = (sweep.runs[run] for run in runs if sweep.runs[run].task == task)
+                steps = min(float(run.tags.get(names.TAG_EARLIER_STEPS, np.inf)) for run in own)
+                if steps < sweep.least_budget(task, runs):
+                    measures[task] = replace(one, until=steps)
         searched = any(names.TAG_PART in sweep.runs[run].tags for run in runs)
         if not searched and any(
             one.horizon < plan.budget.get(task, 0) for task, one in measures.items()

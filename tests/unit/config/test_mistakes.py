@@ -41,6 +41,13 @@ def test_a_dotted_setting_in_a_stage_is_a_mistake(tmp_path: Path, key: str) -> N
     )
 
 
+@pytest.mark.parametrize("key", ["seeds", "tasks"])
+def test_seeds_in_a_grid_have_a_hint(tmp_path: Path, key: str) -> None:
+    hint = rf"grid\.{key} is not a known setting \(did you mean '{key}'"
+    with pytest.raises(ConfigError, match=hint):
+        load(tmp_path, grid={key: [0, 1]})
+
+
 def test_q_without_an_entropy_is_remarked(tmp_path: Path) -> None:
     ddpg: dict[str, Any] = {"policy": "deterministic", "alpha": 0, "bootstrap": "critics"}
     ddpg |= {"behaviour": {"kind": "gaussian_noise"}}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -21,6 +22,7 @@ from music_rllib.envs.fingerprint import (
 from music_rllib.envs.make import make_env
 from music_rllib.envs.tasks import BUILT_IN_TASKS, search_in
 from music_rllib.intrinsic.settings import IntrinsicSettings
+from tests.processes import fresh
 
 FILES = {
     "lab/__init__.py": "",
@@ -243,3 +245,17 @@ def test_an_environment_inside_another_counts(folder: Path) -> None:
     inner.write_text(inner.read_text() + "# changed\n")
     after = fingerprint_of("lab_late:Lab-v0", {})
     assert differences(before, after) == ["lab_inner.py changed"]
+
+
+def test_a_reward_that_names_an_id_has_one_fingerprint(folder: Path) -> None:
+    """Whatever its process has registered before; other processes compare it."""
+    (folder / "lab_reward.py").write_text("SCALES = {'FetchPush-v4': 1.0}\n")
+    code = (
+        "from music_rllib.envs.fingerprint import fingerprint_of\n"
+        "from music_rllib.envs.tasks import register_robotics\n"
+        "first = fingerprint_of('FetchPush-v4', {}, ['lab_reward'])\n"
+        "register_robotics()\n"
+        "assert first == fingerprint_of('FetchPush-v4', {}, ['lab_reward'])\n"
+    )
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[3])}
+    fresh("-c", code, cwd=folder, env=environment)

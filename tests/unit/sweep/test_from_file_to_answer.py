@@ -17,7 +17,7 @@ from music_rllib.config.run_settings import RunSettings
 from music_rllib.envs.tasks import Task
 from music_rllib.errors import BadInputError
 from music_rllib.experiment.open_sweep import OpenSweep, continued_runs_text, open_sweep
-from music_rllib.experiment.plan import continuation_key, make_plan, remarks
+from music_rllib.experiment.plan import Node, continuation_key, make_plan, remarks
 from music_rllib.experiment.record import changes_since, keep_record
 from music_rllib.program import main
 from music_rllib.results.analysis_plan import analysis_plan, plans_in, record_plan
@@ -51,10 +51,13 @@ def opened(folder: Path, content: dict[str, Any]) -> OpenSweep:
     return sweep
 
 
-def play(sweep: OpenSweep, at_ms: int, before: int = 0) -> None:
-    """As if all runs had been trained; those that continue have the reports of `before` ms, too."""
+def play(sweep: OpenSweep, at_ms: int, before: int = 0, nodes: list[Node] | None = None) -> None:
+    """As if all runs, or those of `nodes`, had been trained.
+
+    The reports up to 2,000 steps are of `before` ms: those of runs that this one continues.
+    """
     with StateFile(sweep) as state_file:
-        for node in sweep.plan.nodes:
+        for node in sweep.plan.nodes if nodes is None else nodes:
             q = float(node.run.tac.entropic_index)  # type: ignore[arg-type]
             history = [
                 Report(
@@ -328,3 +331,55 @@ def test_compare_names_the_stage_that_it_shows(tmp_path: Path) -> None:
     found, _ = compare_stage(sweep.location, None, None, minimize=False)
     assert len(found["comparisons"]) == 1
     assert (found["stage"], found["metric"]) == ("her", "evaluation/success_rate")
+
+
+def stages_of(short: int, long: int) -> list[dict[str, Any]]:
+    base = document()["stages"][0]
+    first = base | {"name": "short", "tac": {"lr": 0.002}, "env_steps": short}
+    return [first, base | {"name": "long", "env_steps": long}]
+
+
+@pytest.mark.parametrize(
+    ("raised", "words", "more"),
+    [
+        ((2000, 3000), ("final success at 1,500 steps", "final success at 2,000 steps"), 2),
+        ((2000, 2000), ("final success at 1,500 steps", "final success"), 1),
+        ((1500, 3000), ("final success", "final success at 2,000 steps"), 1),
+    ],
+)
+def test_planned_final_values_stay_those_of_each_stage(
+    tmp_path: Path, raised: tuple[int, int], words: tuple[str, str], more: int
+) -> None:
+    texts = [f"stage = {s}, q = 2 worse than stage = {s}, q = 1" for s in ("short", "long")]
+    analysis: dict[str, Any] = {"hypotheses": texts, "metric": "final", "question": "?"}
+    first = opened(tmp_path, document(stages_of(1500, 2000), analysis=analysis))
+    ((version,), _) = record_plan(first)
+    play(first, version.recorded_ms + 1)
+    before = [float(claim.contrast.difference.value) for claim in studied(tmp_path).planned]
+    again = analysis | {"question": "Still?"}
+    sweep = opened(tmp_path, document(stages_of(*raised), analysis=again))
+    record_plan(sweep)
+    left = [node for node in sweep.plan.nodes if node.key not in sweep.finished]
+    play(sweep, version.recorded_ms + 60_000, before=version.recorded_ms + 1, nodes=left)
+    study = studied(tmp_path)
+    assert tuple(claim.measure.words for claim in study.planned) == words
+    after = [float(claim.contrast.difference.value) for claim in study.planned]
+    assert after == pytest.approx(before)
+    assert [claim.why for claim in study.unplanned] == [
+        "exploratory: over more steps than planned"
+    ] * more
+
+
+def test_all_tasks_over_more_steps_are_compared(tmp_path: Path) -> None:
+    def content(push: int, reach: int) -> dict[str, Any]:
+        own = {"FetchPush": {"env_steps": push}, "FetchReach": {"env_steps": reach}}
+        stage = document()["stages"][0] | {"per_task": own}
+        return document([stage], tasks=["FetchPush", "FetchReach"], analysis=ASKED)
+
+    first = opened(tmp_path, content(2000, 3000))
+    ((version,), _) = record_plan(first)
+    play(first, version.recorded_ms + 1)
+    sweep = opened(tmp_path, content(4000, 6000))
+    record_plan(sweep)
+    play(sweep, version.recorded_ms + 60_000, before=version.recorded_ms + 1)
+    assert len({claim.task for claim in studied(tmp_path).unplanned}) == 3
