@@ -41,17 +41,17 @@ def compare_stage(
     metrics |= {names.EVAL_EPISODES, *names.ENTROPIES, *filter(None, [metric])}
     metrics |= {one.search.objectives[0].metric for one in stages.values() if one.search}
     read = read_stored(location, metrics=metrics)
-    sweep, chosen = read.sweep, [stage]
-    in_report = study_of(sweep) if stage is None else None
-    if in_report is not None:  # several stages side by side have no settings
-        chosen = [in_report.stage.name if in_report.stage else None]
-        chosen += [one.plan.stage for one in sweep.plans[-1:]]
-    settings = config.stage(next((name for name in chosen if name in stages), stage))
+    sweep = read.sweep
+    study = study_of(sweep) if stage is None else None  # as in the report
+    if study is not None:
+        # Stages side by side have a name of their own.
+        known = [study.stage and study.stage.name, *(one.plan.stage for one in sweep.plans[-1:])]
+        stage = next((name for name in known if name in stages), None)
+    settings = config.stage(stage)
     ranking = ranking_metric(settings, sweep)
     shown = metric or (ranking.metric if settings.search else None)
     maximised = not minimize and (ranking.maximised or shown != ranking.metric)
-    study = in_report if metric is None else None
-    if study is None:
+    if study is None or metric is not None:
         higher = maximised or metric is None
         study = study_of(sweep, settings.name, metric=metric, maximised=higher)
     short = ShortLabels.of(run.name for run in sweep.runs)
