@@ -130,9 +130,13 @@ class AnalysisPlan(StrictModel, strict=True):
         return (self.metric, self.margin) == (other.metric, other.margin)
 
     def extends(self, other: AnalysisPlan) -> bool:
-        """Whether this is the same test over at least the steps of the other plan."""
-        same = (self.budget.get(task, steps) >= steps for task, steps in other.budget.items())
-        return self.has_same_test(other) and all(same)
+        """Whether this is the same test over more steps of a task, and no fewer of another.
+
+        Stages can have more steps than a budget: final values can differ with equal ones.
+        """
+        pairs = [(self.budget.get(task, steps), steps) for task, steps in other.budget.items()]
+        more = self.metric == "final" or any(own > steps for own, steps in pairs)
+        return self.has_same_test(other) and more and all(own >= steps for own, steps in pairs)
 
     def asks_as(self, other: AnalysisPlan) -> bool:
         """Whether the `analysis` section is the same; seeds and budgets may differ."""

@@ -31,7 +31,7 @@ from music_rllib.results.conditions import (
     settings_in_words,
     stages_together,
 )
-from music_rllib.results.data import LastValues, Sweep
+from music_rllib.results.data import LastValues, RunRecord, Sweep
 from music_rllib.results.scores import Measure, Scores, counted, first_result, measure_on, scores_of
 from music_rllib.results.statistics import Estimate
 
@@ -226,6 +226,13 @@ def _scopes(tasks: Collection[str], metrics: Collection[str]) -> int:
     return len(tasks) + (len(tasks) > 1 and names.EVAL_RATES.issuperset(metrics))
 
 
+def _earlier_steps(run: RunRecord) -> float:
+    """Steps of the results before the run was extended; infinite if it was not."""
+    with suppress(ValueError):
+        return float(run.tags.get(names.TAG_EARLIER_STEPS, np.inf))
+    return np.inf
+
+
 def _result(claim: Claim) -> tuple[object, ...]:
     """What a claim compares, with the difference: words about several tasks do not name steps."""
     return claim.subject, claim.measure.words, str(claim.contrast.difference.value)
@@ -264,10 +271,15 @@ def _of_plan(
             if task in tasks
         }
         if plan.metric == "final" and keeps_steps:
+            of_plan = [run for one in plan.stages & stages.keys() for run in _runs(stages[one])]
             for task, one in measures.items():
                 own = (sweep.runs[run] for run in runs if sweep.runs[run].task == task)
-                steps = min(float(run.tags.get(names.TAG_EARLIER_STEPS, np.inf)) for run in own)
-                if steps < sweep.least_budget(task, runs):
+                least, steps = sweep.least_budget(task, runs), min(map(_earlier_steps, own))
+                if np.isfinite(steps):  # runs with fewer steps than planned were not the first
+                    steps = max(steps, plan.budget.get(task, 0))
+                elif len(plan.stages) == 1 and least == sweep.least_budget(task, of_plan):
+                    steps = plan.budget.get(task, np.inf)
+                if steps < least:
                     measures[task] = replace(one, until=steps)
         searched = any(names.TAG_PART in sweep.runs[run].tags for run in runs)
         if not searched and any(

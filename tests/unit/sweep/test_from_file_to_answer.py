@@ -383,3 +383,46 @@ def test_all_tasks_over_more_steps_are_compared(tmp_path: Path) -> None:
     record_plan(sweep)
     play(sweep, version.recorded_ms + 60_000, before=version.recorded_ms + 1)
     assert len({claim.task for claim in studied(tmp_path).unplanned}) == 3
+
+
+def test_a_planned_final_value_stays_if_its_runs_are_another_stage_now(tmp_path: Path) -> None:
+    analysis = ASKED | {"metric": "final", "stage": "her"}
+    first = opened(tmp_path, document(analysis=analysis))
+    ((version,), _) = record_plan(first)
+    play(first, version.recorded_ms + 1)
+    base = document()["stages"][0]
+    stages = [base | {"name": "short"}, base | {"env_steps": 4000}]
+    sweep = opened(tmp_path, document(stages, analysis=analysis))
+    record_plan(sweep)
+    left = [node for node in sweep.plan.nodes if node.key not in sweep.finished]
+    play(sweep, version.recorded_ms + 60_000, before=version.recorded_ms + 1, nodes=left)
+    (planned,) = studied(tmp_path).planned
+    assert planned.measure.words == "final success at 2,000 steps"
+
+
+def test_shorter_runs_after_a_result_do_not_move_a_planned_final_value(tmp_path: Path) -> None:
+    analysis = ASKED | {"metric": "final"}
+    first = opened(tmp_path, over(2000, analysis=analysis))
+    ((version,), _) = record_plan(first)
+    play(first, version.recorded_ms + 1)
+    shorter = opened(tmp_path, over(1500, analysis=analysis))
+    record_plan(shorter)
+    play(shorter, version.recorded_ms + 60_000)
+    record_plan(opened(tmp_path, over(2000, analysis=analysis)))
+    study = studied(tmp_path)
+    assert [one.measure.words for one in study.planned] == ["final success"]
+    assert study.unplanned == ()
+
+
+def test_a_task_that_is_added_is_not_over_more_steps(tmp_path: Path) -> None:
+    texts = [f"stage = {s}, q = 2 worse than stage = {s}, q = 1" for s in ("short", "long")]
+    asked = {"hypotheses": texts}
+    first = opened(tmp_path, document(stages_of(1500, 2000), analysis=asked))
+    ((version,), _) = record_plan(first)
+    play(first, version.recorded_ms + 1)
+    both = ["FetchPush", "FetchSlide"]
+    sweep = opened(tmp_path, document(stages_of(1500, 2000), analysis=asked, tasks=both))
+    record_plan(sweep)
+    left = [node for node in sweep.plan.nodes if node.key not in sweep.finished]
+    play(sweep, version.recorded_ms + 60_000, nodes=left)
+    assert not [one for one in studied(tmp_path).unplanned if "more steps" in one.why]
