@@ -81,6 +81,14 @@ def play(sweep: OpenSweep, at_ms: int, before: int = 0, nodes: list[Node] | None
         state_file.end("finished")
 
 
+def planned_and_played(folder: Path, content: dict[str, Any]) -> int:
+    """Record the plan of a sweep before its runs; the time of their results in ms."""
+    sweep = opened(folder, content)
+    ((version,), _) = record_plan(sweep)
+    play(sweep, version.recorded_ms + 1)
+    return version.recorded_ms + 1
+
+
 def test_a_hypothesis_about_runs_that_continue_shown_ones_is_late(tmp_path: Path) -> None:
     now = int(time.time() * 1000)
     play(opened(tmp_path, document()), now - 5000)
@@ -187,14 +195,12 @@ def test_an_objective_that_no_run_reports_is_refused(
 def test_more_steps_after_a_result_are_an_exploratory_comparison(tmp_path: Path) -> None:
     """The planned one stays that over the planned steps."""
     analysis = {"hypotheses": ["q = 2 worse than q = 1"]}
-    first = opened(tmp_path, document(analysis=analysis))
-    ((version,), _) = record_plan(first)
-    play(first, version.recorded_ms + 1)
+    began = planned_and_played(tmp_path, document(analysis=analysis))
     longer = document(analysis=analysis)
     longer["defaults"]["env_steps"] = 4000
     sweep = opened(tmp_path, longer)
     record_plan(sweep)
-    play(sweep, version.recorded_ms + 60_000, before=version.recorded_ms + 1)
+    play(sweep, began + 60_000, before=began)
     study = study_of(read_sweep(str(tmp_path / "results/s")).sweep)
     (planned,), (unplanned,) = study.planned, study.unplanned
     assert planned.measure.words == "mean success over 2,000 steps"
@@ -217,25 +223,21 @@ def studied(folder: Path) -> Study:
 
 def test_a_planned_final_value_is_that_at_the_planned_steps(tmp_path: Path) -> None:
     analysis = ASKED | {"metric": "final"}
-    first = opened(tmp_path, over(2000, analysis=analysis))
-    ((version,), _) = record_plan(first)
-    play(first, version.recorded_ms + 1)
+    began = planned_and_played(tmp_path, over(2000, analysis=analysis))
     (before,) = studied(tmp_path).planned
     sweep = opened(tmp_path, over(4000, analysis=analysis))
     record_plan(sweep)
-    play(sweep, version.recorded_ms + 60_000, before=version.recorded_ms + 1)
+    play(sweep, began + 60_000, before=began)
     (planned,) = studied(tmp_path).planned
     assert float(planned.contrast.difference.value) == float(before.contrast.difference.value)
     assert planned.measure.words == "final success at 2,000 steps"
 
 
 def test_fewer_steps_than_planned_have_no_verdict(tmp_path: Path) -> None:
-    first = opened(tmp_path, over(4000, analysis=ASKED))
-    ((version,), _) = record_plan(first)
-    play(first, version.recorded_ms + 1)
+    began = planned_and_played(tmp_path, over(4000, analysis=ASKED))
     sweep = opened(tmp_path, over(2000, analysis=ASKED))
     record_plan(sweep)
-    play(sweep, version.recorded_ms + 60_000)
+    play(sweep, began + 60_000)
     study = studied(tmp_path)
     assert study.planned == ()
     assert "fewer env_steps than planned" in study.untested[0]
@@ -296,12 +298,10 @@ def test_an_export_tells_conditions_apart_by_their_paths(tmp_path: Path) -> None
 
 def test_a_new_margin_does_not_move_a_planned_final_value(tmp_path: Path) -> None:
     analysis = ASKED | {"metric": "final"}
-    first = opened(tmp_path, over(2000, analysis=analysis))
-    ((version,), _) = record_plan(first)
-    play(first, version.recorded_ms + 1)
+    began = planned_and_played(tmp_path, over(2000, analysis=analysis))
     sweep = opened(tmp_path, over(4000, analysis=analysis | {"margin": 0.2}))
     record_plan(sweep)
-    play(sweep, version.recorded_ms + 60_000, before=version.recorded_ms + 1)
+    play(sweep, began + 60_000, before=began)
     (planned,) = studied(tmp_path).planned
     assert planned.measure.words == "final success at 2,000 steps"
 
@@ -311,9 +311,7 @@ def test_a_planned_final_value_of_an_unchanged_stage_stays(tmp_path: Path) -> No
     stages = [short, {**document()["stages"][0], "name": "long", "env_steps": 4000}]
     texts = [f"stage = {s}, q = 2 worse than stage = {s}, q = 1" for s in ("short", "long")]
     analysis: dict[str, Any] = {"hypotheses": texts, "metric": "final"}
-    first = opened(tmp_path, document(stages, analysis=analysis))
-    ((version,), _) = record_plan(first)
-    play(first, version.recorded_ms + 1)
+    planned_and_played(tmp_path, document(stages, analysis=analysis))
     before = studied(tmp_path).planned[1]
     fewer = analysis | {"hypotheses": texts[1:]}
     record_plan(opened(tmp_path, document(stages, analysis=fewer)))
@@ -352,15 +350,13 @@ def test_planned_final_values_stay_those_of_each_stage(
 ) -> None:
     texts = [f"stage = {s}, q = 2 worse than stage = {s}, q = 1" for s in ("short", "long")]
     analysis: dict[str, Any] = {"hypotheses": texts, "metric": "final", "question": "?"}
-    first = opened(tmp_path, document(stages_of(1500, 2000), analysis=analysis))
-    ((version,), _) = record_plan(first)
-    play(first, version.recorded_ms + 1)
+    began = planned_and_played(tmp_path, document(stages_of(1500, 2000), analysis=analysis))
     before = [float(claim.contrast.difference.value) for claim in studied(tmp_path).planned]
     again = analysis | {"question": "Still?"}
     sweep = opened(tmp_path, document(stages_of(*raised), analysis=again))
     record_plan(sweep)
     left = [node for node in sweep.plan.nodes if node.key not in sweep.finished]
-    play(sweep, version.recorded_ms + 60_000, before=version.recorded_ms + 1, nodes=left)
+    play(sweep, began + 60_000, before=began, nodes=left)
     study = studied(tmp_path)
     assert tuple(claim.measure.words for claim in study.planned) == words
     after = [float(claim.contrast.difference.value) for claim in study.planned]
@@ -376,38 +372,32 @@ def test_all_tasks_over_more_steps_are_compared(tmp_path: Path) -> None:
         stage = document()["stages"][0] | {"per_task": own}
         return document([stage], tasks=["FetchPush", "FetchReach"], analysis=ASKED)
 
-    first = opened(tmp_path, content(2000, 3000))
-    ((version,), _) = record_plan(first)
-    play(first, version.recorded_ms + 1)
+    began = planned_and_played(tmp_path, content(2000, 3000))
     sweep = opened(tmp_path, content(4000, 6000))
     record_plan(sweep)
-    play(sweep, version.recorded_ms + 60_000, before=version.recorded_ms + 1)
+    play(sweep, began + 60_000, before=began)
     assert len({claim.task for claim in studied(tmp_path).unplanned}) == 3
 
 
 def test_a_planned_final_value_stays_if_its_runs_are_another_stage_now(tmp_path: Path) -> None:
     analysis = ASKED | {"metric": "final", "stage": "her"}
-    first = opened(tmp_path, document(analysis=analysis))
-    ((version,), _) = record_plan(first)
-    play(first, version.recorded_ms + 1)
+    began = planned_and_played(tmp_path, document(analysis=analysis))
     base = document()["stages"][0]
     stages = [base | {"name": "short"}, base | {"env_steps": 4000}]
     sweep = opened(tmp_path, document(stages, analysis=analysis))
     record_plan(sweep)
     left = [node for node in sweep.plan.nodes if node.key not in sweep.finished]
-    play(sweep, version.recorded_ms + 60_000, before=version.recorded_ms + 1, nodes=left)
+    play(sweep, began + 60_000, before=began, nodes=left)
     (planned,) = studied(tmp_path).planned
     assert planned.measure.words == "final success at 2,000 steps"
 
 
 def test_shorter_runs_after_a_result_do_not_move_a_planned_final_value(tmp_path: Path) -> None:
     analysis = ASKED | {"metric": "final"}
-    first = opened(tmp_path, over(2000, analysis=analysis))
-    ((version,), _) = record_plan(first)
-    play(first, version.recorded_ms + 1)
+    began = planned_and_played(tmp_path, over(2000, analysis=analysis))
     shorter = opened(tmp_path, over(1500, analysis=analysis))
     record_plan(shorter)
-    play(shorter, version.recorded_ms + 60_000)
+    play(shorter, began + 60_000)
     record_plan(opened(tmp_path, over(2000, analysis=analysis)))
     study = studied(tmp_path)
     assert [one.measure.words for one in study.planned] == ["final success"]
@@ -417,12 +407,10 @@ def test_shorter_runs_after_a_result_do_not_move_a_planned_final_value(tmp_path:
 def test_a_task_that_is_added_is_not_over_more_steps(tmp_path: Path) -> None:
     texts = [f"stage = {s}, q = 2 worse than stage = {s}, q = 1" for s in ("short", "long")]
     asked = {"hypotheses": texts}
-    first = opened(tmp_path, document(stages_of(1500, 2000), analysis=asked))
-    ((version,), _) = record_plan(first)
-    play(first, version.recorded_ms + 1)
+    began = planned_and_played(tmp_path, document(stages_of(1500, 2000), analysis=asked))
     both = ["FetchPush", "FetchSlide"]
     sweep = opened(tmp_path, document(stages_of(1500, 2000), analysis=asked, tasks=both))
     record_plan(sweep)
     left = [node for node in sweep.plan.nodes if node.key not in sweep.finished]
-    play(sweep, version.recorded_ms + 60_000, nodes=left)
+    play(sweep, began + 60_000, nodes=left)
     assert not [one for one in studied(tmp_path).unplanned if "more steps" in one.why]
