@@ -282,17 +282,19 @@ def _package(name: str, file: Path) -> str:
 
 def _file_of(name: str) -> Path | None:
     """The file of a module, which is not imported; None for built-in and missing ones."""
-    top, *rest = name.split(".")
+    package, *rest = name.split(".")
     try:
-        spec = importlib.util.find_spec(top)
+        spec = importlib.util.find_spec(package)
         for part in rest:
             if spec is None:
                 return None
-            package = sys.modules.get(spec.name)
-            folders = getattr(package, "__path__", spec.submodule_search_locations)
+            locations = spec.submodule_search_locations
+            folders = getattr(sys.modules.get(package), "__path__", locations)
             if folders is None:  # `from module import name`
                 return None
-            spec = PathFinder.find_spec(f"{spec.name}.{part}", folders)
+            # By its last name, since a package without `__init__.py` needs an imported parent.
+            spec = PathFinder.find_spec(part, [*folders])
+            package = f"{package}.{part}"
     except (ImportError, ValueError, AttributeError):
         return None
     file = Path(spec.origin) if spec and spec.has_location and spec.origin else None

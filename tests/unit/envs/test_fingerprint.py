@@ -137,6 +137,13 @@ def test_a_module_that_is_imported_later_is_not_imported(folder: Path) -> None:
     assert "lab_late" not in sys.modules
 
 
+def test_folders_without_an_init_file_are_packages(folder: Path) -> None:
+    (folder / "lab_late.py").write_text("from lab_tools.poses.grasp import top\n")
+    (folder / "lab_tools/poses/grasp").mkdir(parents=True)
+    (folder / "lab_tools/poses/grasp/top.py").write_text("")
+    assert "source lab_tools/poses/grasp/top.py" in now(folder)
+
+
 def crlf(path: Path) -> None:
     path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))
 
