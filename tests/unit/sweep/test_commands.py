@@ -952,7 +952,7 @@ def test_plan_as_json_with_more_seeds(
     ("reward", "message"),
     [
         ("speeds:Missing", "must name a subclass of IntrinsicReward in speeds"),
-        ("speeds:Speed", "intrinsic.settings must fit speeds:Speed: missing a required argument"),
+        ("speeds:Speed", "intrinsic.settings must fit speeds:Speed: missing a required"),
     ],
 )
 def test_plan_refuses_an_own_reward_that_does_not_fit(
