@@ -184,8 +184,6 @@ TAG_PRUNED = "pruned"
 TAG_EARLIER_RESULT = "earlier_result"
 """Time in ms of the first result of an earlier plan's run with other `env_steps`, which begins like
 this run. Only in exports and in sweeps read from the storage."""
-TAG_EARLIER_STEPS = "earlier_steps"
-"""Environment steps of the shortest of these runs that the present plan does not have."""
 TAG_FAILURE = "failure"
 """First lines of the cause of a failed run."""
 TAG_GIT_COMMIT = "git_commit"

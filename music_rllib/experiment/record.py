@@ -148,18 +148,12 @@ def results_of_other_budgets(sweep: OpenSweep) -> dict[str, dict[str, str]]:
     counts, ours = Counter(known.values()), {*own.values()}
     shared = [key for key, of in known.items() if counts[of] > 1 and of in ours]
     times: dict[str, int] = {}
-    steps: dict[str, int] = {}
     for key in sweep.store.finished(shared) if shared else ():
         with contextlib.suppress(StorageError):  # the result of a damaged run is not known
-            of, last = known[key], sweep.store.history(key)[-1]
-            times[of] = min(times.get(of, last.timestamp_ms), last.timestamp_ms)
-            if key not in own:
-                steps[of] = min(steps.get(of, last.env_steps), last.env_steps)
+            of, ended = known[key], sweep.store.history(key)[-1].timestamp_ms
+            times[of] = min(times.get(of, ended), ended)
     return {
-        key: {names.TAG_EARLIER_RESULT: str(times[of])}
-        | ({names.TAG_EARLIER_STEPS: str(steps[of])} if of in steps else {})
-        for key, of in own.items()
-        if of in times
+        key: {names.TAG_EARLIER_RESULT: str(times[of])} for key, of in own.items() if of in times
     }
 
 

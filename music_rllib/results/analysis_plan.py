@@ -13,11 +13,12 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
 import yaml
 from pydantic import Field, TypeAdapter, model_validator
 
@@ -91,8 +92,10 @@ class AnalysisPlan(StrictModel, strict=True):
     control: Line
     """What is held equal so that different q can be compared."""
     budget: dict[Line, int]
-    """Environment steps over which runs are compared, by task."""
+    """Environment steps over which runs are compared, by task: the fewest of any stage."""
     test: Line
+    more_steps: dict[Line, dict[Line, int]] = Field({})
+    """The steps of stages that have more than `budget`, by stage and task."""
 
     @model_validator(mode="after")
     def _are_hypotheses(self) -> Self:
@@ -124,18 +127,22 @@ class AnalysisPlan(StrictModel, strict=True):
 
     @property
     def hash(self) -> str:
-        return content_key(self.model_dump(mode="json"))
+        # A field that a version of the package adds must not change the hashes of earlier plans.
+        return content_key(self.model_dump(mode="json", exclude_defaults=True))
+
+    def steps(self, stages: Collection[str], task: str) -> float:
+        """Environment steps over which runs of these stages are compared; infinite if unknown."""
+        least = self.budget.get(task, np.inf)
+        return min(self.more_steps.get(stage, {}).get(task, least) for stage in stages)
 
     def has_same_test(self, other: AnalysisPlan) -> bool:
         return (self.metric, self.margin) == (other.metric, other.margin)
 
-    def extends(self, other: AnalysisPlan) -> bool:
-        """Whether this is the same test over more steps of a task, and no fewer of another.
-
-        Stages can have more steps than a budget: final values can differ with equal ones.
-        """
-        pairs = [(self.budget.get(task, steps), steps) for task, steps in other.budget.items()]
-        more = self.metric == "final" or any(own > steps for own, steps in pairs)
+    def extends(self, other: AnalysisPlan, stages: Collection[str]) -> bool:
+        """Whether this is the same test over more steps of a task, and no fewer of another."""
+        tasks = self.budget.keys() & other.budget.keys()
+        pairs = [(self.steps(stages, task), other.steps(stages, task)) for task in tasks]
+        more = any(own > steps for own, steps in pairs)
         return self.has_same_test(other) and more and all(own >= steps for own, steps in pairs)
 
     def asks_as(self, other: AnalysisPlan) -> bool:
@@ -186,7 +193,7 @@ def checked_plans(document: Any) -> tuple[PlanVersion, ...]:
 
 def as_document(versions: Sequence[PlanVersion]) -> list[dict[str, Any]]:
     """Inverse of :func:`checked_plans`."""
-    return [version.model_dump(mode="json") for version in versions]
+    return [version.model_dump(mode="json", exclude_defaults=True) for version in versions]
 
 
 def with_plan(
@@ -203,7 +210,7 @@ def as_markdown(name: str, versions: Sequence[PlanVersion]) -> str:
     """The versions as Markdown, the newest first."""
     parts = [f"# Analysis plan of {name}\n\n{_NOTE}\n"]
     for one in reversed(versions):
-        content = one.plan.model_dump(mode="json", exclude_none=True)
+        content = one.plan.model_dump(mode="json", exclude_none=True, exclude_defaults=True)
         text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=88)
         parts.append(
             f"## Version {one.version}\n\nRecorded {one.recorded}. Hash of the plan "
@@ -228,6 +235,13 @@ def analysis_plan(config: SweepConfig) -> AnalysisPlan | None:
     margin = analysis.margin
     if margin is None and metrics == [names.EVAL_SUCCESS]:
         margin = MARGIN_OF_A_RATE
+    steps = _steps(stages, config if analysis.metric == "auc_total" else None)
+    tasks = dict.fromkeys(task for own in steps.values() for task in own)
+    budget = {task: min(own[task] for own in steps.values() if task in own) for task in tasks}
+    more = {
+        stage: {task: number for task, number in own.items() if number > budget[task]}
+        for stage, own in steps.items()
+    }
     return AnalysisPlan(
         question=analysis.question,
         hypotheses=analysis.hypotheses,
@@ -237,8 +251,9 @@ def analysis_plan(config: SweepConfig) -> AnalysisPlan | None:
         margin=margin,
         seeds=_of_each({stage.name: _seeds(stage, config.seeds) for stage in stages}),
         control=_of_each({stage.name: _control(stage) for stage in stages}),
-        budget=_budget(stages, config if analysis.metric == "auc_total" else None),
+        budget=budget,
         test=_TEST,
+        more_steps={stage: own for stage, own in more.items() if own},
     )
 
 
@@ -285,21 +300,22 @@ def is_controlled(alpha: str) -> bool:
     return any(word in alpha for word in ("matched", "learned", "normalised"))
 
 
-def _budget(stages: Sequence[Stage], pretrained_in: SweepConfig | None) -> dict[str, int]:
-    """Smallest budget of each task in any stage; in a search, of its runs on fresh seeds.
+def _steps(stages: Sequence[Stage], pretrained_in: SweepConfig | None) -> dict[str, dict[str, int]]:
+    """Smallest budget by stage and task; in a search, of its runs on fresh seeds.
 
     Pretraining stages of the sweep `pretrained_in` count; None: pretraining does not count.
     """
-    budget: dict[str, int] = {}
+    found: dict[str, dict[str, int]] = {}
     for stage in stages:
         final = stage.search.final if stage.search else None
+        of_stage = found.setdefault(stage.name, {})
         for point in stage.points:
             for task, run in point.runs.items():
                 steps = (final.env_steps if final else None) or run.env_steps
                 if pretrained_in is not None:
                     steps += _steps_before(pretrained_in, stage, task)
-                budget[task] = min(budget.get(task, steps), steps)
-    return budget
+                of_stage[task] = min(of_stage.get(task, steps), steps)
+    return found
 
 
 def _steps_before(config: SweepConfig, stage: Stage, task: str) -> int:

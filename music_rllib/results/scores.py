@@ -99,11 +99,13 @@ def measure_on(
         horizon: Largest number of environment steps.
     """
     own = [run for run in runs if sweep.runs[run].task == task]
+    least = sweep.least_budget(task, own)
     measure = Measure(
         kind=kind,
         metric=metric or sweep.primary_metric(task),
-        horizon=min(horizon, sweep.least_budget(task, own)),
+        horizon=min(horizon, least),
         maximised=maximised,
+        until=horizon if horizon < least else np.inf,
     )
     if not any(has_failed(sweep, run, measure.metric) for run in own):
         return measure

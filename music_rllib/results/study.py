@@ -31,7 +31,7 @@ from music_rllib.results.conditions import (
     settings_in_words,
     stages_together,
 )
-from music_rllib.results.data import LastValues, RunRecord, Sweep
+from music_rllib.results.data import LastValues, Sweep
 from music_rllib.results.scores import Measure, Scores, counted, first_result, measure_on, scores_of
 from music_rllib.results.statistics import Estimate
 
@@ -111,45 +111,14 @@ def study_of(
     latest = sweep.plans[-1] if sweep.plans else None
     in_time = _planned_in_time(sweep, stages)
     plan = max(in_time.values(), key=lambda one: one.recorded_ms, default=None)
-    chosen = stages.get(stage or (latest.plan.stage if latest else ""))
-    if chosen is None and stage is None:
-        chosen = next((s for s in reversed(stages.values()) if s.has_task_reward), None)
-    pairs = pairs_of(chosen.compared) if chosen else []
-    if latest and not pairs and stage in (None, latest.plan.stage):
-        of_hypotheses = [found for name, found in stages.items() if name in latest.plan.stages]
-        chosen = stages_together(of_hypotheses) or chosen
+    chosen, pairs = _chosen(stages, stage, latest)
     untested: dict[str, int] = {}
     planned: list[Claim] = []
     for version in sweep.plans:
         own = [key for key, planned_by in in_time.items() if planned_by is version]
-        planned += _of_plan(sweep, stages, version, own, untested, keeps_steps=True)
+        planned += _of_plan(sweep, stages, version, own, untested)
     without_test = sum(untested.values())
-    unplanned: list[Claim] = []
-    late: list[PlannedHypothesis] = []
-    if latest is not None:
-        now = latest.plan.planned
-        late = [one for one in now if one not in in_time]
-        again = [
-            one
-            for one in now
-            if one in in_time and not latest.plan.has_same_test(in_time[one].plan)
-        ]
-        why = "exploratory: runs of it had finished before the plan" if plan else ""
-        of_late = _of_plan(sweep, stages, latest, late, untested)
-        unplanned += [replace(claim, why=why) for claim in of_late]
-        unplanned += _of_plan(sweep, stages, latest, again, untested)
-        longer = [
-            one
-            for one in now
-            if in_time.get(one, latest) is not latest and latest.plan.extends(in_time[one].plan)
-        ]
-        why = "exploratory: over more steps than planned"
-        known = [_result(claim) for claim in planned]
-        unplanned += [
-            replace(claim, why=why)
-            for claim in _of_plan(sweep, stages, latest, longer, untested)
-            if _result(claim) not in known
-        ]
+    unplanned = list(_outside_the_plan(sweep, stages, in_time, planned, untested))
     means: list[Mean] = []
     if chosen is not None:
         kind, margin = "auc", None
@@ -168,11 +137,9 @@ def study_of(
         if plan is None:
             rates = {measure.metric for measure in measures.values()}
             without_test = len(pairs) * _scopes(chosen.tasks, rates) - len(of_stage)
-    of_plan = [
-        found
-        for name, found in stages.items()
-        if any(name in one.stages for one in (*in_time, *late))
-    ]
+    late = [one for one in latest.plan.planned if one not in in_time] if latest else []
+    names_of_plan = {name for one in (*in_time, *late) for name in one.stages}
+    of_plan = [found for name, found in stages.items() if name in names_of_plan]
     compared = [run for one in filter(None, [chosen, *of_plan]) for run in _runs(one)]
     return Study(
         stage=chosen,
@@ -196,6 +163,48 @@ def study_of(
         family=len(planned if plan else unplanned) + without_test,
         runs=tuple(dict.fromkeys(compared)),
     )
+
+
+def _chosen(
+    stages: dict[str, StageRuns], stage: str | None, latest: PlanVersion | None
+) -> tuple[StageRuns | None, list[tuple[Condition, Condition]]]:
+    """The stage of the comparisons outside the plan, and its pairs of conditions."""
+    chosen = stages.get(stage or (latest.plan.stage if latest else ""))
+    if chosen is None and stage is None:
+        chosen = next((s for s in reversed(stages.values()) if s.has_task_reward), None)
+    pairs = pairs_of(chosen.compared) if chosen else []
+    if latest and not pairs and stage in (None, latest.plan.stage):
+        of_hypotheses = [found for name, found in stages.items() if name in latest.plan.stages]
+        chosen = stages_together(of_hypotheses) or chosen
+    return chosen, pairs
+
+
+def _outside_the_plan(
+    sweep: Sweep,
+    stages: Mapping[str, StageRuns],
+    in_time: Mapping[PlannedHypothesis, PlanVersion],
+    planned: Sequence[Claim],
+    untested: dict[str, int],
+) -> Iterator[Claim]:
+    """Claims of the last version that are late, or were planned with another test or fewer steps.
+
+    Fills `untested`, as `_of_plan` does.
+    """
+    for latest in sweep.plans[-1:]:
+        before = {one: in_time.get(one) for one in latest.plan.planned}
+        late = [one for one, by in before.items() if by is None]
+        why = "exploratory: runs of it had finished before the plan" if in_time else ""
+        for claim in _of_plan(sweep, stages, latest, late, untested):
+            yield replace(claim, why=why)
+        again = [one for one, by in before.items() if by and not latest.plan.has_same_test(by.plan)]
+        yield from _of_plan(sweep, stages, latest, again, untested)
+        longer = [
+            one for one, by in before.items() if by and latest.plan.extends(by.plan, one.stages)
+        ]
+        known = [_result(claim) for claim in planned]
+        for claim in _of_plan(sweep, stages, latest, longer, untested):
+            if _result(claim) not in known:
+                yield replace(claim, why="exploratory: over more steps than planned")
 
 
 def _runs(stage: StageRuns) -> list[int]:
@@ -226,13 +235,6 @@ def _scopes(tasks: Collection[str], metrics: Collection[str]) -> int:
     return len(tasks) + (len(tasks) > 1 and names.EVAL_RATES.issuperset(metrics))
 
 
-def _earlier_steps(run: RunRecord) -> float:
-    """Steps of the results before the run was extended; infinite if it was not."""
-    with suppress(ValueError):
-        return float(run.tags.get(names.TAG_EARLIER_STEPS, np.inf))
-    return np.inf
-
-
 def _result(claim: Claim) -> tuple[object, ...]:
     """What a claim compares, with the difference: words about several tasks do not name steps."""
     return claim.subject, claim.measure.words, str(claim.contrast.difference.value)
@@ -244,13 +246,10 @@ def _of_plan(
     version: PlanVersion,
     hypotheses: Sequence[PlannedHypothesis],
     untested: dict[str, int],
-    *,
-    keeps_steps: bool = False,
 ) -> Iterator[Claim]:
     """The undecided claims of some of a plan's hypotheses.
 
-    Fills `untested` with reasons and the number of comparisons that can't be tested. With
-    `keeps_steps`, final values are those at the steps of the first results.
+    Fills `untested` with reasons and the number of comparisons that can't be tested.
     """
     plan = version.plan
     sweep = counted(sweep, plan.metric) if hypotheses else sweep
@@ -265,25 +264,15 @@ def _of_plan(
             untested[f"{hypothesis.text}: {pairs}"] = scopes
             continue
         runs = [run for pair in pairs for condition in pair for run in condition.runs]
+        steps = {task: plan.steps(key.stages, task) for task in tasks}
         measures = {
-            task: measure_on(sweep, task, runs, plan.metric, horizon=plan.budget.get(task, np.inf))
+            task: measure_on(sweep, task, runs, plan.metric, horizon=steps[task])
             for task in dict.fromkeys(sweep.runs[run].task for run in runs)
             if task in tasks
         }
-        if plan.metric == "final" and keeps_steps:
-            of_plan = [run for one in plan.stages & stages.keys() for run in _runs(stages[one])]
-            for task, one in measures.items():
-                own = (sweep.runs[run] for run in runs if sweep.runs[run].task == task)
-                least, steps = sweep.least_budget(task, runs), min(map(_earlier_steps, own))
-                if np.isfinite(steps):  # runs with fewer steps than planned were not the first
-                    steps = max(steps, plan.budget.get(task, 0))
-                elif len(plan.stages) == 1 and least == sweep.least_budget(task, of_plan):
-                    steps = plan.budget.get(task, np.inf)
-                if steps < least:
-                    measures[task] = replace(one, until=steps)
         searched = any(names.TAG_PART in sweep.runs[run].tags for run in runs)
         if not searched and any(
-            one.horizon < plan.budget.get(task, 0) for task, one in measures.items()
+            one.horizon < steps[task] < np.inf for task, one in measures.items()
         ):
             untested[f"{hypothesis.text}: its runs have fewer env_steps than planned"] = scopes
             continue
