@@ -1,7 +1,6 @@
 """Write the results pages and their figures from the runs in docs/results/data.
 
-python -m docs.generate_results            # write them and the picture of the README
-python -m docs.generate_results --check    # exit code 1 if a page is out of date
+python -m docs.generate_results    # write them and the picture of the README
 
 The texts of the pages are in docs/results (`PAGES`), the code of their tables in result_pages. The
 generator replaces `{{ KIND NAME }}` by a table of the sweep NAME. If tune_configs has a sweep of
@@ -21,7 +20,6 @@ trained them; otherwise it has the runs of the export docs/results/data/NAME. KI
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -61,29 +59,17 @@ NOTICE = "<!-- Written by docs/generate_results.py from docs/results/{} and docs
 NOT_RUN = "*Not run yet.*"
 
 
-def main() -> int:
-    """Write the pages, or check them."""
+def main() -> None:
+    """Write the pages."""
     figures: dict[str, Drawing] = {}
-    texts = {FOLDER / name: page(name, figures) for name in PAGES}
-    if "--check" in sys.argv[1:]:
-        stale = [
-            str(path)
-            for path, text in texts.items()
-            if not path.exists() or path.read_text("utf-8") != text
-        ]
-        if stale:
-            names_of = ", ".join(stale)
-            print(f"Out of date: {names_of}. python -m docs.generate_results", file=sys.stderr)
-        return int(bool(stale))
-    for path, text in texts.items():
-        path.write_text(text, encoding="utf-8")
+    for name in PAGES:
+        (FOLDER / name).write_text(page(name, figures), encoding="utf-8")
     FIGURES.mkdir(parents=True, exist_ok=True)
     for old in FIGURES.glob("*.svg"):
         old.unlink()
     for name, drawing in figures.items():
         (FIGURES / name).write_bytes(files(drawing.subplots, drawing.legend)[".svg"])
     PICTURE.write_bytes(overview())
-    return 0
 
 
 def page(name: str, figures: dict[str, Drawing]) -> str:
@@ -137,4 +123,4 @@ def page(name: str, figures: dict[str, Drawing]) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -10,9 +10,10 @@ import numpy as np
 
 from docs.result_pages.summary import STUDIES, between_q, complete_studies
 from music_rllib.results.answer import p_in_words
-from music_rllib.results.claims import Claim, Contrast, Verdict, contrast, decided
+from music_rllib.results.claims import Claim, Verdict, contrast, decided
 from music_rllib.results.data import Sweep
 from music_rllib.results.scores import counted, scores_of
+from music_rllib.results.statistics import Array
 
 MORE = {"claims-slide": 1}
 """Number of hypotheses dropped from a study before its first run."""
@@ -75,9 +76,11 @@ def _stabilities() -> tuple[Stability, ...]:
 
 def _stability(sweep: Sweep, planned: Sequence[Claim], at: int) -> Stability:
     claim, cut = planned[at], MORE.get(sweep.name, 0)
+    scores = [_scores(sweep, one) for one in planned]
     verdicts = [
         decided(
-            [replace(one, contrast=_without(sweep, one, seed)) for one in planned], planned=True
+            [_without(seed, one, own) for one, own in zip(planned, scores, strict=True)],
+            planned=True,
         )[at].verdict
         for seed in range(claim.contrast.seeds[0])
     ]
@@ -85,12 +88,17 @@ def _stability(sweep: Sweep, planned: Sequence[Claim], at: int) -> Stability:
     return Stability(sweep.name, claim, verdicts.count(claim.verdict), more)
 
 
-def _without(sweep: Sweep, claim: Claim, left_out: int) -> Contrast:
-    """The contrast of a claim without one of its paired seeds."""
+def _scores(sweep: Sweep, claim: Claim) -> Array:
+    """The scores of both sides of a claim by paired seed, `[2, seeds]`."""
     ((first, second),) = claim.pairs
     sides = [
         scores_of(sweep, condition, claim.task, claim.measure).by_seed
         for condition in (first, second)
     ]
-    x, y = (np.delete([side[seed] for seed in sides[0]], left_out) for side in sides)
-    return contrast(x, y, paired=True, margin=claim.margin)
+    return np.array([[side[seed] for seed in sides[0]] for side in sides])
+
+
+def _without(left_out: int, claim: Claim, scores: Array) -> Claim:
+    """The claim without one of its paired seeds."""
+    x, y = np.delete(scores, left_out, axis=1)
+    return replace(claim, contrast=contrast(x, y, paired=True, margin=claim.margin))

@@ -8,9 +8,10 @@ values do not differ once all runs are at the ceiling.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -250,8 +251,8 @@ def with_pretraining(sweep: Sweep) -> Sweep:
         while (source := position.get(sweep.runs[chain[0]].source, -1)) not in (-1, *chain):
             chain.insert(0, source)
 
-    def whole(column: Column, chain: Sequence[int]) -> Column:
-        before, parts = 0, []
+    def whole(metric: str, chain: Sequence[int]) -> Column:
+        column, before, parts = sweep.history[metric], 0, []
         for part in chain:
             own = column.of_run(part)
             if part != chain[-1]:  # the last evaluation of a run can be after its budget
@@ -262,15 +263,32 @@ def with_pretraining(sweep: Sweep) -> Sweep:
         curve = joined(parts)
         return curve.select(np.diff(curve.step, append=np.iinfo(np.int64).max) > 0)
 
-    history = {
-        metric: joined([whole(column, chain) for chain in chains])
-        for metric, column in sweep.history.items()
-    }
+    def of_all(metric: str) -> Column:
+        return joined([whole(metric, chain) for chain in chains])
+
     runs = [
         replace(run, params={**run.params, "env_steps": str(sum(budgets[i] for i in chain))})
         for run, chain in zip(sweep.runs, chains, strict=True)
     ]
-    return replace(sweep, runs=runs, history=history)
+    return replace(sweep, runs=runs, history=_WhenRead(sweep.history, of_all))
+
+
+class _WhenRead(Mapping[str, Column]):
+    """The columns of these metrics, each computed when it is first read: most are not."""
+
+    def __init__(self, metrics: Collection[str], column: Callable[[str], Column]) -> None:
+        self._metrics, self._column = metrics, cache(column)
+
+    def __getitem__(self, metric: str) -> Column:
+        if metric not in self._metrics:
+            raise KeyError(metric)
+        return self._column(metric)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._metrics)
+
+    def __len__(self) -> int:
+        return len(self._metrics)
 
 
 def counted(sweep: Sweep, kind: str) -> Sweep:
