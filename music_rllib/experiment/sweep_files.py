@@ -42,6 +42,8 @@ from music_rllib.store.storage import (
 
 CONFIG, PLAN, SEARCH, STATE = "config.json", "plan.json", "search.json", "state.json"
 ANALYSIS_PLAN = "analysis_plan.json"
+EXPORT = "sweep.json"
+"""Only in the folder of an exported sweep."""
 IN_STORAGE = "storage:"
 """Prefix of a handoff's key in `config.json`: the folder that the user gave may have changed."""
 STOP = "stop.json"
@@ -134,6 +136,8 @@ def find_sweep(place: str, storage: str | None) -> SweepLocation:
     check_answers(location.storage)
     if location.read(CONFIG) is None:
         got = f"SWEEP must be a sweep that was started, got {redact(place)}"
+        if EXPORT in location.files.files():
+            raise BadInputError(f"{got}, an exported sweep: `music-rllib report` shows it")
         if (inside := _names(location.files)) != "none":
             raise BadInputError(f"{got}, a storage with the sweeps {inside}")
         raise BadInputError(

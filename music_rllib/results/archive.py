@@ -19,7 +19,7 @@ import pyarrow as pa
 from pydantic import BaseModel, ConfigDict, Field
 
 from music_rllib.errors import reason_of
-from music_rllib.experiment.sweep_files import CONFIG
+from music_rllib.experiment.sweep_files import ANALYSIS_PLAN, CONFIG, EXPORT, SEARCH
 from music_rllib.limits import (
     MOST_JSON_BYTES,
     MOST_YAML_BYTES,
@@ -42,7 +42,6 @@ from music_rllib.results.data import (
 from music_rllib.store.tables import read_table, write_table
 
 Format = Literal["csv", "parquet"]
-_HEADER, _SEARCHES, _PLANS = "sweep.json", "search.json", "analysis_plan.json"
 _OWN_FIELDS = ("name", "status", "started", "source", "tags", "config")
 _RUNS = {
     "run": pa.int64(),
@@ -80,7 +79,7 @@ def _without_folders(place: str) -> str:
 
 def is_archive(folder: Path) -> bool:
     """Whether `folder` holds an exported sweep, and is not that of a sweep itself."""
-    return os.path.lexists(folder / _HEADER) and not os.path.lexists(folder / CONFIG)
+    return os.path.lexists(folder / EXPORT) and not os.path.lexists(folder / CONFIG)
 
 
 def write_archive(sweep: Sweep, folder: Path, file_format: Format = "parquet") -> None:
@@ -92,8 +91,8 @@ def write_archive(sweep: Sweep, folder: Path, file_format: Format = "parquet") -
         ReportError: The folder is not writable, or holds files of a sweep or of the user.
     """
     tables = [f"{one}.{kind}" for one in ("runs", "metrics") for kind in get_args(Format)]
-    own = (CONFIG, _HEADER, *tables, _SEARCHES, _PLANS)
-    is_ours = is_archive(folder) and _is_header(folder / _HEADER)
+    own = (CONFIG, EXPORT, *tables, SEARCH, ANALYSIS_PLAN)
+    is_ours = is_archive(folder) and _is_header(folder / EXPORT)
     if not is_ours and (found := [name for name in own if os.path.lexists(folder / name)]):
         raise ReportError(
             f"--export must be a new folder or that of an earlier export, got {folder}, which has "
@@ -116,15 +115,15 @@ def write_archive(sweep: Sweep, folder: Path, file_format: Format = "parquet") -
             write_table(_runs_table(sweep.runs), new / f"runs.{file_format}")
             write_table(metrics_table(sweep), new / f"metrics.{file_format}")
             if sweep.searches:
-                _write_json([_without_place(found) for found in sweep.searches], new / _SEARCHES)
+                _write_json([_without_place(found) for found in sweep.searches], new / SEARCH)
             if sweep.plans:
-                _write_json(as_document(sweep.plans), new / _PLANS)
-            _write_json(header, new / _HEADER)
-            for stale in (*tables, _SEARCHES, _PLANS):
+                _write_json(as_document(sweep.plans), new / ANALYSIS_PLAN)
+            _write_json(header, new / EXPORT)
+            for stale in (*tables, SEARCH, ANALYSIS_PLAN):
                 if not (new / stale).exists():
                     (folder / stale).unlink(missing_ok=True)
             # The header first: without it, what an interruption leaves would not be replaced.
-            for file in sorted(new.iterdir(), key=lambda file: file.name != _HEADER):
+            for file in sorted(new.iterdir(), key=lambda file: file.name != EXPORT):
                 file.replace(folder / file.name)
     except OSError as error:
         raise ReportError(f"{folder} must be writable: {error}") from error
@@ -136,7 +135,7 @@ def read_archive(folder: Path) -> Sweep:
     Raises:
         ReportError: A file is missing or malformed.
     """
-    file = folder / _HEADER
+    file = folder / EXPORT
     try:
         header = _Header.model_validate(_read_json(file))
         file = folder / f"runs.{header.format}"
@@ -148,9 +147,9 @@ def read_archive(folder: Path) -> Sweep:
         if len(run) and not 0 <= run.min() <= run.max() < len(records):
             raise ValueError(f"a metric's run must be one of {len(records)}, got {run.max()}")
         history = by_metric(metrics["metric"], Column(*points))
-        file = folder / _SEARCHES
+        file = folder / SEARCH
         found = checked_searches(_read_json(file)) if file.exists() else ()
-        file = folder / _PLANS
+        file = folder / ANALYSIS_PLAN
         plans = checked_plans(_read_json(file)) if file.exists() else ()
     except (OSError, KeyError, TypeError, ValueError, OverflowError, pa.ArrowException) as error:
         raise ReportError(

@@ -391,6 +391,9 @@ def test_resume_needs_a_sweep(program: Program, tmp_path: Path) -> None:
     result = program(None, "resume", str(tmp_path / "results/s"))
     assert result.exit_code == 2
     assert "SWEEP must be a sweep that was started" in result.stderr
+    (tmp_path / "results/s/sweep.json").write_text("{}")
+    result = program(None, "compare", str(tmp_path / "results/s"))
+    assert "an exported sweep: `music-rllib report` shows it" in result.stderr
 
 
 def test_a_storage_or_sweep_in_place_of_what_it_contains(program: Program, tmp_path: Path) -> None:
