@@ -100,7 +100,7 @@ def headline() -> str:
         for setting, claim in claims
         if (claim.first, claim.second) == asked and claim.verdict is Verdict.SUPERIOR
     ]
-    answer = "In no study here is q = 1.5 better than q = 1."
+    answer = "No study here shows that q = 1.5 is better than q = 1."
     if better:
         answer = f"q = 1.5 is better than q = 1 on {' and '.join(better)}."
     found = [claim for _, claim in claims]
@@ -133,8 +133,8 @@ def _averages(claims: Sequence[Claim]) -> str:
         f"{q} minus q = 1, {g.value:+.2f} (95% CI {g.lower:.2f} to {g.upper:.2f})" for q, g in gaps
     )
     return (
-        f" Mean difference of the area over the {len(tasks)} tasks, each the mean of its settings "
-        f"(not planned): {'; '.join(parts)}."
+        f" Mean difference of the area under the success curve over the {len(tasks)} tasks, each "
+        f"the mean of its settings (not planned): {'; '.join(parts)}."
     )
 
 

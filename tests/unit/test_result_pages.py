@@ -68,7 +68,7 @@ def test_pretraining_counts_towards_an_equal_total() -> None:
     [
         (
             (Verdict.UNDECIDED, Verdict.UNDECIDED, Verdict.WORSE),
-            "In no study here is q = 1.5 better than q = 1.",
+            "No study here shows that q = 1.5 is better than q = 1.",
             "",
         ),
         (
@@ -78,7 +78,7 @@ def test_pretraining_counts_towards_an_equal_total() -> None:
         ),
         (
             (Verdict.UNDECIDED, Verdict.UNDECIDED, Verdict.UNDECIDED),
-            "In no study here is q = 1.5 better than q = 1.",
+            "No study here shows that q = 1.5 is better than q = 1.",
             " No comparison of q is decided on FetchPush.",
         ),
     ],

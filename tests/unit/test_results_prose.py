@@ -32,6 +32,7 @@ from tests.unit.test_results_recomputed import (
     last,
     median_wait,
     planned,
+    rate_interval,
     runs,
     table,
 )
@@ -104,7 +105,7 @@ def test_counts_of_verdicts_and_of_intervals() -> None:
         sides.append(pair + ", ".join(f"{n} {word}" for word, n in counts.items() if n))
     assert f"Verdicts on {'; '.join(verdicts)}. Mean difference" in TEXT
     assert f"adjusted) for {'; '.join(sides)}. Mean" in TEXT
-    assert f"at most {4 * np.log(2):.2f}." in TEXT
+    assert f"at most {4 * np.log(2):.2f};" in TEXT
 
 
 def test_observations_about_exploration() -> None:
@@ -131,8 +132,15 @@ def test_observations_about_exploration() -> None:
     assert far.format(*less["1.5"]) in TEXT
     assert "q = 2 {}, {} and {} cm (exclude 0)".format(*less["2"]) in TEXT
     assert all(moved[study, "1.5"]["95"][1] > 0 > moved[study, "2"]["95"][1] for study in equal)
-    broader = [entropy[study, "2"] for study in ("joint-her", "joint-pick", "joint-pick-fresh")]
+    fixed, learned, slide = (entropy[study, "2"] for study in equal)
+    assert (
+        f"policies of q = 2 are {-fixed:.1f} and {-learned:.1f} nats narrower than those of q = 1 "
+        f"on FetchPush, and {slide:.1f} nats broader on FetchSlide."
+    ) in TEXT
+    wide = ("joint-her", "joint-pick", "joint-pick-fresh")
+    broader = [entropy[study, "2"] for study in wide]
     assert f"of q = 2 are {min(broader):.1f} to {max(broader):.1f} nats broader" in TEXT
+    assert all(moved[study, "2"]["95"][0] < 0 < moved[study, "2"]["95"][1] for study in wide)
     final = [last("claims-pick-and-place", MEAN, "music-r", q).mean() for q in Q]
     assert f"ends at {final[0]:.0%} success, q = 1.5 at {final[1]:.0%}." in TEXT
     early_on = [early(*each, q, ENTROPIES[0]).mean() for each in TEN_Q[1:2] for q in Q]
@@ -196,7 +204,13 @@ def test_runs_that_diverged() -> None:
     key, final = list(diverged.items())[2]
     (run,) = runs("joint-pick-fresh", "music-r").query("q == '1.5' and seed == @key[2]").run
     lowest = curve("joint-pick-fresh", run, ENTROPIES[0])[1].min()
+    seeds = len(last("joint-pick-fresh", MEAN, "music-r", "1.5"))
+    assert f"One run of {seeds} with q = 1.5 diverged {rate(1, seeds)}, as" in TEXT
     assert f"narrowed to {lowest:.1f} nats (seed {key[2]}), and ended at {final:.0%}" in TEXT
+    larger, between, _ = planned("joint-pick-fresh", "music-r", left_out=key[2])
+    assert (larger["verdict"], between["verdict"]) == ("undecided", "worse")
+    words = in_words(between, planned=True).split("**, ")[1].split(";")[0]
+    assert f"would be undecided, and q = 2 worse than q = 1.5: {words})" in TEXT
     seeds = len(last("equal-entropy", MEAN, "music-r", "2"))
     assert f"**diverged in two of {seeds} runs** {rate(2, seeds)}" in TEXT
     *_, (key, final) = diverged.items()
@@ -244,14 +258,20 @@ def test_the_success_of_all_runs_of_music_on_fetchpickandplace() -> None:
     studies = ("joint-pick-fresh", "joint-pick", *others)
     finals = [last(study, MEAN, "music-r", "1") for study in studies]
     every = pd.concat(finals)
-    low, high = stats.t.interval(0.95, len(every) - 1, every.mean(), stats.sem(every))
+    _, low, high = rate_interval(every.to_numpy(), 50)
     first, second, _, other = (f"{one.mean():.0%}" for one in finals)
     assert (
-        f"MUSIC-r with the same settings ends at {first} and {second} in the two studies above, "
-        f"and at {other} on those ten: on all {len(every)} seeds at {every.mean():.0%} (95% CI "
-        f"{low:.0%} to {high:.0%}), {sum(every >= 0.9)} of them at 90% or more."
+        f"MUSIC-r with the same settings ends at {first} and {second} in the studies of 35 and of "
+        f"ten seeds in the section above, and at {other} on those ten: on all {len(every)} seeds "
+        f"at {every.mean():.0%} (95% CI {low:.0%} to {high:.0%}), {sum(every >= 0.9)} of them at "
+        "90% or more."
     ) in TEXT
     assert f"({every.mean():.0%} over {len(every)} seeds of four studies)" in README
+
+
+def test_the_median_that_the_plan_asked_for() -> None:
+    median = last("pick-and-place-in-80000-steps", MEAN, "music-r", "1").median()
+    assert f"it is ahead (median {median:.0%}; the plan asked for 90%)" in TEXT
 
 
 def test_fetchpickandplace_at_equal_total_steps() -> None:
@@ -315,7 +335,8 @@ def test_the_papers_own_setting() -> None:
     assert f"complete, {len(exported(pilot))} of 4 runs" in TEXT
     own = exported(first).iloc[0]
     of = own["param.music.batch_trajectories"]
-    assert f"trained on {of} trajectories in place of 4,096, and α = {own['tag.alpha']} (" in TEXT
+    trained = f"trained on {of} trajectories in place of the original's 4,096"
+    assert f"{trained}, and α = {own['tag.alpha']} (" in TEXT
     epochs = [runs(first, stage).budget.item() // 80_000 for stage in ("pretrain", "music-r")]
     assert (
         f"{sum(epochs)} of the paper's 100 epochs ({epochs[0]} of MUSIC-u and {epochs[1]}" in TEXT
@@ -328,6 +349,10 @@ def test_the_bonus_for_moving_the_object() -> None:
     _, verdict, _, final, *_ = rows["displacement"]  # recomputed with the table
     numbers = verdict.rsplit(";", 1)[0]
     assert f"it is {numbers}, and ends at {final.split()[0]} ([eight rewards]" in TEXT
+    rows = {row[0]: row for row in table("## Intrinsic rewards on FetchPush", DETAILS)}
+    _, verdict, *_, seeds = rows["music-r"]
+    numbers = verdict.rsplit(";", 1)[0]
+    assert f"20,000 steps ({WORDS[int(seeds)]} seeds) it is {numbers} ([eight rewards]" in TEXT
 
 
 def test_figures_of_the_readme() -> None:

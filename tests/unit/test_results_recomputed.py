@@ -254,7 +254,7 @@ def test_the_averages_over_tasks(metric: str, after: str) -> None:
         ends = stats.t.interval(0.95, len(gaps) - 1, np.mean(gaps), stats.sem(gaps))
         interval = f"{ends[0]:.2f} to {ends[1]:.2f}"
         found.append(f"q = {q} minus q = 1, {np.mean(gaps):+.2f} (95% CI {interval})")
-    text = "area over the 3 tasks, each the mean of its settings (not planned): "
+    text = "under the success curve over the 3 tasks, each the mean of its settings (not planned): "
     line = next(one for one in PAGE[PAGE.index(after) :].splitlines() if text in one)
     assert f"{text}{'; '.join(found)}." in line
 
@@ -507,5 +507,5 @@ def test_the_observations_in_the_joint_form_on_fetchslide() -> None:
     )
     assert (
         f"its 150,000 steps have an area of {own.mean():.2f}, the first 150,000 of HER alone "
-        f"{alone.mean():.2f} (95% CI of the difference {interval(own - alone, '.2f')})"
+        f"{alone.mean():.2f} (95% CI of the difference {interval(own - alone, '.2f')}, which includes"
     ) in text

@@ -104,7 +104,7 @@ def test_the_settings_of_hindsight_alone() -> None:
     before, own, alone, slide, pick = first.values()
     assert (
         f"{before.budget:,} steps of MUSIC-u and {own.budget:,} of MUSIC-r, against "
-        f"{alone.budget:,} of HER alone (α = {own.alpha} and {alone.alpha})"
+        f"{alone.budget:,} of HER alone (α = {own.alpha} and, for HER alone, {alone.alpha})"
     ) in TEXT
     assert f"HER alone has q = 1, α = {slide.alpha} and {slide.budget:,} steps." in TEXT
     assert f"HER alone has q = 1 and α = {pick.alpha} " in TEXT
