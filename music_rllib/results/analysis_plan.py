@@ -138,13 +138,6 @@ class AnalysisPlan(StrictModel, strict=True):
     def has_same_test(self, other: AnalysisPlan) -> bool:
         return (self.metric, self.margin) == (other.metric, other.margin)
 
-    def extends(self, other: AnalysisPlan, stages: Collection[str]) -> bool:
-        """Whether this is the same test over more steps of a task, and no fewer of another."""
-        tasks = self.budget.keys() & other.budget.keys()
-        pairs = [(self.steps(stages, task), other.steps(stages, task)) for task in tasks]
-        more = any(own > steps for own, steps in pairs)
-        return self.has_same_test(other) and more and all(own >= steps for own, steps in pairs)
-
     def asks_as(self, other: AnalysisPlan) -> bool:
         """Whether the `analysis` section is the same; seeds and budgets may differ."""
         asked = {"question", "hypotheses", "stage", "metric", "margin"}

@@ -295,6 +295,8 @@ def claims_of(
         measure, *others = own.values()
         if any(other.horizon != measure.horizon for other in others):
             measure = replace(measure, horizon=np.nan)
+        if any(other.until != measure.until for other in others):
+            measure = replace(measure, until={"": np.nan})
         # A margin of 1 or more can only be meant for returns.
         default = measure.metric == names.EVAL_SUCCESS and (margin is None or margin >= 1)
         own_margin = MARGIN_OF_A_RATE if default else margin

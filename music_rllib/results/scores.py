@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 
 import numpy as np
@@ -34,8 +34,9 @@ class Measure:
     tasks with different horizons."""
     maximised: bool = True
     worst: float = np.nan
-    until: float = np.inf
-    """Environment steps at which the final value is read, if the runs have more than planned."""
+    until: Mapping[str, float] = field(default_factory=dict)
+    """By stage: environment steps at which its final values are read, if runs have more than
+    planned; infinite: their last. NaN for several tasks with different steps."""
 
     @property
     def is_rate(self) -> bool:
@@ -52,8 +53,10 @@ class Measure:
         """`mean success over 100,000 steps`."""
         word = names.word_of(self.metric)
         if self.kind == "final":
-            at = f" at {self.until:,.0f} steps" if np.isfinite(self.until) else ""
-            return f"final {word}{at}"
+            steps = {*self.until.values()}
+            (only,) = steps if len(steps) == 1 else (np.nan,)
+            at = f" at {only:,.0f} steps" if np.isfinite(only) else " at the planned steps"
+            return f"final {word}{at * bool(steps)}"
         budget = "the budget" if np.isnan(self.horizon) else f"{self.horizon:,.0f} steps"
         return f"mean {word} over {budget}" + ", pretraining included" * (self.kind == "auc_total")
 
@@ -87,6 +90,7 @@ def measure_on(
     *,
     maximised: bool = True,
     horizon: float = np.inf,
+    until: Mapping[str, float] | None = None,
 ) -> Measure:
     """The measure by which runs on a task are compared.
 
@@ -98,6 +102,7 @@ def measure_on(
         kind: As in `Measure`, like `maximised`.
         metric: None: the task's primary one.
         horizon: Largest number of environment steps.
+        until: As in `Measure`.
     """
     own = [run for run in runs if sweep.runs[run].task == task]
     least = sweep.least_budget(task, own)
@@ -106,7 +111,7 @@ def measure_on(
         metric=metric or sweep.primary_metric(task),
         horizon=min(horizon, least),
         maximised=maximised,
-        until=horizon if horizon < least else np.inf,
+        until=until or {},
     )
     if not any(has_failed(sweep, run, measure.metric) for run in own):
         return measure
@@ -148,12 +153,13 @@ def _score(sweep: Sweep, run: int, measure: Measure) -> float:
     steps, values = sweep.finite(run, measure.metric)
     if measure.kind != "final" and measure.horizon > 0:
         return area_under_curve(steps, values, measure.horizon)
-    return float(values[_end(steps, measure)]) if len(values) else np.nan
+    until = measure.until.get(sweep.runs[run].stage, np.inf)
+    return float(values[_end(steps, until)]) if len(values) else np.nan
 
 
-def _end(steps: Array, measure: Measure) -> int:
+def _end(steps: Array, until: float) -> int:
     """Position of the final value: the first evaluation at `until` or later, or the last one."""
-    return min(int(np.searchsorted(steps, measure.until)), len(steps) - 1)
+    return min(int(np.searchsorted(steps, until)), len(steps) - 1)
 
 
 def scores_of(sweep: Sweep, condition: Condition, task: str, measure: Measure) -> Scores:
@@ -185,7 +191,7 @@ def _evaluations(sweep: Sweep, run: int, measure: Measure) -> tuple[Array, float
     steps, values = sweep.finite(run, measure.metric)
     whole = measure.kind != "final" and measure.horizon > 0
     episodes = sweep.final(run, names.EVAL_EPISODES)
-    end = _end(steps, measure)
+    end = _end(steps, measure.until.get(sweep.runs[run].stage, np.inf))
     used = values[steps <= max(measure.horizon, steps[0])] if whole else values[end : end + 1]
     return used, np.inf if episodes is None else episodes
 

@@ -199,12 +199,58 @@ def _outside_the_plan(
         again = [one for one, by in before.items() if by and not latest.plan.has_same_test(by.plan)]
         yield from _of_plan(sweep, stages, latest, again, untested)
         longer = [
-            one for one, by in before.items() if by and latest.plan.extends(by.plan, one.stages)
+            one for one, by in before.items() if by and _is_longer(sweep, stages, latest, by, one)
         ]
         known = [_result(claim) for claim in planned]
         for claim in _of_plan(sweep, stages, latest, longer, untested):
             if _result(claim) not in known:
                 yield replace(claim, why="exploratory: over more steps than planned")
+
+
+def _is_longer(
+    sweep: Sweep,
+    stages: Mapping[str, StageRuns],
+    latest: PlanVersion,
+    before: PlanVersion,
+    key: PlannedHypothesis,
+) -> bool:
+    """Whether `latest` has the same test over more steps of a task, and no fewer of another."""
+    tasks = _tasks_of_all(sweep, key.stages, before.plan.budget.keys())
+    # Areas end at the same steps in all stages, final values at those of their own.
+    groups = [[one] for one in key.stages] if latest.plan.metric == "final" else [key.stages]
+    steps = [
+        (latest.plan.steps(group, task), planned.steps(group, task))
+        for task in tasks & latest.plan.budget.keys()
+        for planned in [_plan_on(sweep, stages, before, key, task)]
+        if task in planned.budget
+        for group in groups
+    ]
+    more = any(own > planned for own, planned in steps)
+    none_fewer = all(own >= planned for own, planned in steps)
+    return latest.plan.has_same_test(before.plan) and more and none_fewer
+
+
+def _plan_on(
+    sweep: Sweep,
+    stages: Mapping[str, StageRuns],
+    version: PlanVersion,
+    key: PlannedHypothesis,
+    task: str,
+) -> AnalysisPlan:
+    """The plan whose steps count on a task; if it was added, the last one before its results."""
+    if task in version.plan.budget:
+        return version.plan
+    runs = (run for name in key.stages & stages.keys() for run in stages[name].runs)
+    time = first_result(sweep, (run for run in runs if sweep.runs[run].task == task))
+    added = [
+        one.plan
+        for one in sweep.plans
+        if one.recorded_ms < time
+        and one.plan.metric == version.plan.metric
+        and task in one.plan.budget
+        and key.stages <= one.plan.stages
+    ]
+    return added[-1] if added else version.plan
 
 
 def _runs(stage: StageRuns) -> list[int]:
@@ -264,9 +310,17 @@ def _of_plan(
             untested[f"{hypothesis.text}: {pairs}"] = scopes
             continue
         runs = [run for pair in pairs for condition in pair for run in condition.runs]
-        steps = {task: plan.steps(key.stages, task) for task in tasks}
+        plans = {task: _plan_on(sweep, stages, version, key, task) for task in tasks}
+        steps = {task: plans[task].steps(key.stages, task) for task in tasks}
         measures = {
-            task: measure_on(sweep, task, runs, plan.metric, horizon=steps[task])
+            task: measure_on(
+                sweep,
+                task,
+                runs,
+                plan.metric,
+                horizon=steps[task],
+                until=_ends(sweep, stages, plans[task], key, task),
+            )
             for task in dict.fromkeys(sweep.runs[run].task for run in runs)
             if task in tasks
         }
@@ -285,6 +339,27 @@ def _of_plan(
             reason = "no seed has finished in both conditions"
             untested[f"{hypothesis.text}{where if claims else ''}: {reason}"] = scopes - len(claims)
         yield from (replace(claim, hypothesis=hypothesis) for claim in claims)
+
+
+def _ends(
+    sweep: Sweep,
+    stages: Mapping[str, StageRuns],
+    plan: AnalysisPlan,
+    key: PlannedHypothesis,
+    task: str,
+) -> dict[str, float]:
+    """By stage, the steps of final values; empty if no stage has more steps than planned."""
+    found = [stages[name] for name in key.stages & stages.keys()]
+    if len(plan.stages) > 1 and not plan.more_steps:
+        # Plans of earlier versions of the package do not have the steps of each stage.
+        tags = (sweep.runs[run].tags for stage in found for run in stage.runs)
+        if not any(names.TAG_EARLIER_RESULT in own for own in tags):
+            return {}
+    ends = {}
+    for stage in found:
+        planned, least = plan.steps([stage.name], task), sweep.least_budget(task, _runs(stage))
+        ends[stage.name] = planned if planned < least < np.inf else np.inf
+    return ends if any(map(np.isfinite, ends.values())) else {}
 
 
 def untestable(planned: Plan, plan: AnalysisPlan) -> Iterator[str]:

@@ -507,5 +507,5 @@ def test_the_observations_in_the_joint_form_on_fetchslide() -> None:
     )
     assert (
         f"its 150,000 steps have an area of {own.mean():.2f}, the first 150,000 of HER alone "
-        f"{alone.mean():.2f} (95% CI of the difference {interval(own - alone, '.2f')}, which includes"
+        f"{alone.mean():.2f} (95% CI of the difference {interval(own - alone, '.2f')}, which"
     ) in text

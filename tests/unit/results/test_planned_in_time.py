@@ -225,3 +225,85 @@ def test_a_task_that_is_added_is_not_over_more_steps(tmp_path: Path) -> None:
     left = [node for node in sweep.plan.nodes if node.key not in sweep.finished]
     play(sweep, began + 60_000, nodes=left)
     assert not [one for one in studied(tmp_path).unplanned if "more steps" in one.why]
+
+
+@pytest.mark.parametrize("metric", ["auc", "final"])
+def test_the_planned_comparison_of_an_added_task_keeps_its_steps(
+    tmp_path: Path, metric: str
+) -> None:
+    def content(steps: int) -> dict[str, Any]:
+        both = ["FetchPush", "FetchSlide"]
+        return over(steps, tasks=both, analysis=ASKED | {"metric": metric})
+
+    planned_and_played(tmp_path, over(2000, analysis=ASKED | {"metric": metric}))
+    time.sleep(0.01)
+    sweep = opened(tmp_path, content(2000))
+    shown = record_plan(sweep)[0][-1].recorded_ms + 1
+    left = [node for node in sweep.plan.nodes if node.key not in sweep.finished]
+    play(sweep, shown, nodes=left)
+    before = {one.task: float(one.contrast.difference.value) for one in studied(tmp_path).planned}
+    longer = opened(tmp_path, content(4000))
+    record_plan(longer)
+    play(longer, shown + 60_000, before=shown)
+    study = studied(tmp_path)
+    after = {one.task: float(one.contrast.difference.value) for one in study.planned}
+    assert after == pytest.approx(before)
+    assert {one.task for one in study.unplanned} == before.keys()
+
+
+@pytest.mark.parametrize("raised", [(1500, 3000), (2000, 3000), (2000, 2000)])
+def test_a_planned_final_value_of_two_stages_stays(tmp_path: Path, raised: tuple[int, int]) -> None:
+    texts = ["stage = long, q = 2 better than stage = short, q = 2"]
+    analysis: dict[str, Any] = {"hypotheses": texts, "metric": "final"}
+    began = planned_and_played(tmp_path, document(stages_of(1500, 2000), analysis=analysis))
+    (before,) = studied(tmp_path).planned
+    sweep = opened(tmp_path, document(stages_of(*raised), analysis=analysis))
+    record_plan(sweep)
+    left = [node for node in sweep.plan.nodes if node.key not in sweep.finished]
+    play(sweep, began + 60_000, before=began, nodes=left)
+    study = studied(tmp_path)
+    (planned,) = study.planned
+    assert float(planned.contrast.difference.value) == float(before.contrast.difference.value)
+    assert "more steps" in study.unplanned[0].why
+
+
+def test_a_planned_final_value_of_longer_runs_is_their_last(tmp_path: Path) -> None:
+    grid = {"tac.entropic_index": [1.0, 2.0], "env_steps": [1500, 2000]}
+    text = "q = 2, env_steps = 2000 worse than q = 1, env_steps = 2000"
+    stage = {"name": "her", "variant": "tac", "grid": grid}
+    analysis = {"hypotheses": [text], "metric": "final"}
+    planned_and_played(tmp_path, document([stage], analysis=analysis))
+    (planned,) = studied(tmp_path).planned
+    assert float(planned.contrast.difference.value) == pytest.approx(-0.1)  # at 1,500: -0.075
+    assert planned.measure.words == "final success"
+
+
+def test_final_values_over_all_tasks_do_not_name_the_steps_of_one(tmp_path: Path) -> None:
+    def content(push: int, reach: int) -> dict[str, Any]:
+        own = {"FetchPush": {"env_steps": push}, "FetchReach": {"env_steps": reach}}
+        stage = document()["stages"][0] | {"per_task": own}
+        asked = ASKED | {"metric": "final"}
+        return document([stage], tasks=["FetchPush", "FetchReach"], analysis=asked)
+
+    began = planned_and_played(tmp_path, content(1500, 2000))
+    sweep = opened(tmp_path, content(2000, 3000))
+    record_plan(sweep)
+    play(sweep, began + 60_000, before=began)
+    assert studied(tmp_path).planned[0].measure.words == "final success at the planned steps"
+
+
+def test_final_values_by_a_plan_without_the_steps_of_each_stage(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Plans of earlier versions of the package have the fewest steps of any stage only."""
+    analysis: dict[str, Any] = {"hypotheses": OF_EACH_STAGE, "metric": "final"}
+    content = document(stages_of(1500, 2000), analysis=analysis)
+    with monkeypatch.context() as earlier:
+        module = "music_rllib.results.analysis_plan"
+        plan = analysis_plan(loaded(tmp_path, content))
+        assert plan is not None
+        without = plan.model_copy(update={"more_steps": {}})
+        earlier.setattr(f"{module}.analysis_plan", lambda _: without)
+        planned_and_played(tmp_path, content)
+    words = [claim.measure.words for claim in studied(tmp_path).planned]
+    assert words == ["final success", "final success"]
