@@ -8,7 +8,8 @@ evaluations of every run; a run that failed or is still running is censored at i
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -19,6 +20,7 @@ from music_rllib import names
 from music_rllib.results import statistics as st
 from music_rllib.results.conditions import (
     ALL_TASKS,
+    ALPHA,
     AVERAGED,
     Condition,
     StageRuns,
@@ -26,6 +28,7 @@ from music_rllib.results.conditions import (
 )
 from music_rllib.results.data import Ints, RunRecord, Sweep
 from music_rllib.results.statistics import Array, Estimate
+from music_rllib.results.study import Mean
 
 THRESHOLDS = (0.5, 0.85)
 """Success rates of the times to a threshold; the paper's Figure 4 uses 85%."""
@@ -290,3 +293,21 @@ def mixed(runs: Iterable[RunRecord], label: Callable[[str], str] = str) -> Itera
                 f"Runs on {task} are compared that used {len(groups)} versions of its environment: "
                 f"{'; '.join(parts)}."
             )
+
+
+# Sensitivity to α ---------------------------------------------------------------------------------
+
+AlphaLine = Sequence[tuple[float, Mean]]
+"""Values of α in increasing order, with the mean scores of conditions that differ only in α."""
+
+
+def alpha_lines(means: Sequence[Mean]) -> list[AlphaLine]:
+    """Lines with at least two values of α; conditions whose α is not a number are left out."""
+    groups: defaultdict[tuple[object, ...], list[tuple[float, Mean]]] = defaultdict(list)
+    for mean in means:
+        settings = dict(mean.condition.others)
+        with suppress(ValueError):
+            alpha = float(settings.pop(ALPHA, ""))
+            key = (mean.task, mean.condition.entropic_index, *settings.items())
+            groups[key].append((alpha, mean))
+    return [sorted(line, key=lambda point: point[0]) for line in groups.values() if len(line) > 1]

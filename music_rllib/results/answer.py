@@ -11,7 +11,7 @@ import numpy as np
 from music_rllib import names
 from music_rllib.results.analysis_plan import AnalysisPlan, PlannedHypothesis, is_controlled
 from music_rllib.results.claims import FEWEST_SEEDS, Claim, Verdict
-from music_rllib.results.conditions import ALL_TASKS, Condition
+from music_rllib.results.conditions import ALL_TASKS, MOST_CONDITIONS, Condition
 from music_rllib.results.data import Sweep
 from music_rllib.results.scores import has_failed
 from music_rllib.results.statistics import (
@@ -25,7 +25,7 @@ from music_rllib.results.statistics import (
     seeds_needed,
     value_text,
 )
-from music_rllib.results.study import MOST_CONDITIONS, Mean, Study
+from music_rllib.results.study import Mean, Study
 
 MOST_CLAIMS = 4
 """Number of claims with a sentence of their own; the others are in the table."""

@@ -11,6 +11,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import combinations
 
 from music_rllib import names
 from music_rllib.config.schema import Hypothesis, same_value
@@ -35,6 +36,8 @@ IN_WORDS = {
     "music.mi_reward_weight": ("MI weight", names.TAG_MI_REWARD_WEIGHT),
 }
 """Settings that can be schedules and then span several params: label, and tag with the words."""
+MOST_CONDITIONS = 6
+"""Number of conditions up to which all pairs are compared; otherwise each with a reference."""
 _OWN_SETTINGS = "intrinsic.settings."
 """Beginning of the settings of an intrinsic reward. A run has only those that are given."""
 
@@ -316,3 +319,21 @@ def _rest(condition: Condition, named: set[str]) -> Values:
     """The condition's settings that the hypothesis does not name."""
     settings = ((ENTROPIC_INDEX, condition.entropic_index), *condition.others)
     return tuple(pair for pair in settings if pair[0] not in named)
+
+
+def pairs_of(conditions: Sequence[Condition]) -> list[tuple[Condition, Condition]]:
+    """Pairs of a later condition and an earlier one; of many conditions, each and its reference.
+
+    The reference has the same other settings and q = 1, or the smallest q. If no two conditions
+    have the same other settings, it is the first condition with this q.
+    """
+    if len(conditions) <= MOST_CONDITIONS:
+        return [(second, first) for first, second in combinations(conditions, 2)]
+    indices = [one.entropic_index for one in conditions]
+    reference = "1" if "1" in indices else indices[0]
+    references = {one.others: one for one in conditions if one.entropic_index == reference}
+    pairs = [(one, references[one.others]) for one in conditions if one.others in references]
+    if all(one is other for one, other in pairs):
+        first = conditions[indices.index(reference)]
+        pairs = [(one, first) for one in conditions]
+    return [(one, other) for one, other in pairs if one is not other]

@@ -7,11 +7,8 @@ and an unadjusted p-value.
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence, Set
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import combinations
 
 import numpy as np
 
@@ -22,11 +19,11 @@ from music_rllib.results import statistics as st
 from music_rllib.results.analysis_plan import AnalysisPlan, PlannedHypothesis, PlanVersion
 from music_rllib.results.claims import Claim, claims_of, decided, exploratory
 from music_rllib.results.conditions import (
-    ALPHA,
     Condition,
     StageRuns,
     find_stages,
     matching,
+    pairs_of,
     pairs_of_hypothesis,
     settings_in_words,
     stages_together,
@@ -34,9 +31,6 @@ from music_rllib.results.conditions import (
 from music_rllib.results.data import LastValues, Sweep
 from music_rllib.results.scores import Measure, Scores, counted, first_result, measure_on, scores_of
 from music_rllib.results.statistics import Estimate
-
-MOST_CONDITIONS = 6
-"""Number of conditions up to which all pairs are compared; otherwise each with a reference."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -404,24 +398,6 @@ def _tasks_of_all(sweep: Sweep, stages: Collection[str], planned: Set[str]) -> S
     return frozenset[str].intersection(*(frozenset(one or planned) | unknown for one in known))
 
 
-def pairs_of(conditions: Sequence[Condition]) -> list[tuple[Condition, Condition]]:
-    """Pairs of a later condition and an earlier one; of many conditions, each and its reference.
-
-    The reference has the same other settings and q = 1, or the smallest q. If no two conditions
-    have the same other settings, it is the first condition with this q.
-    """
-    if len(conditions) <= MOST_CONDITIONS:
-        return [(second, first) for first, second in combinations(conditions, 2)]
-    indices = [one.entropic_index for one in conditions]
-    reference = "1" if "1" in indices else indices[0]
-    references = {one.others: one for one in conditions if one.entropic_index == reference}
-    pairs = [(one, references[one.others]) for one in conditions if one.others in references]
-    if all(one is other for one, other in pairs):
-        first = conditions[indices.index(reference)]
-        pairs = [(one, first) for one in conditions]
-    return [(one, other) for one, other in pairs if one is not other]
-
-
 def _means(sweep: Sweep, stage: StageRuns, measures: Mapping[str, Measure]) -> Iterator[Mean]:
     for task, measure in measures.items():
         for condition in stage.compared:
@@ -436,21 +412,3 @@ def _means(sweep: Sweep, stage: StageRuns, measures: Mapping[str, Measure]) -> I
                     scores=scores,
                     runs=sum(sweep.runs[run].task == task for run in condition.runs),
                 )
-
-
-# Sensitivity to α ---------------------------------------------------------------------------------
-
-AlphaLine = Sequence[tuple[float, Mean]]
-"""Values of α in increasing order, with the mean scores of conditions that differ only in α."""
-
-
-def alpha_lines(means: Sequence[Mean]) -> list[AlphaLine]:
-    """Lines with at least two values of α; conditions whose α is not a number are left out."""
-    groups: defaultdict[tuple[object, ...], list[tuple[float, Mean]]] = defaultdict(list)
-    for mean in means:
-        settings = dict(mean.condition.others)
-        with suppress(ValueError):
-            alpha = float(settings.pop(ALPHA, ""))
-            key = (mean.task, mean.condition.entropic_index, *settings.items())
-            groups[key].append((alpha, mean))
-    return [sorted(line, key=lambda point: point[0]) for line in groups.values() if len(line) > 1]

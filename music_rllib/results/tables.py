@@ -23,8 +23,9 @@ from music_rllib.results.answer import (
     p_in_words,
     verdict_in_words,
 )
+from music_rllib.results.conditions import pairs_of
 from music_rllib.results.statistics import FEWEST_FOR_INTERVAL, SHOW_SEEDS_BELOW, Estimate, number
-from music_rllib.results.study import Study, pairs_of
+from music_rllib.results.study import Study
 
 DASH = "–"
 """Stands in a table for a missing value."""

@@ -32,13 +32,21 @@ from music_rllib.results.analysis import (
     Metric,
     Scope,
     StageAnalysis,
+    alpha_lines,
     curve,
 )
 from music_rllib.results.claims import Claim
-from music_rllib.results.conditions import ALPHA, OF_TASK, Condition, StageRuns, stages_together
+from music_rllib.results.conditions import (
+    ALPHA,
+    MOST_CONDITIONS,
+    OF_TASK,
+    Condition,
+    StageRuns,
+    stages_together,
+)
 from music_rllib.results.data import Sweep
 from music_rllib.results.statistics import SHOW_SEEDS_BELOW
-from music_rllib.results.study import MOST_CONDITIONS, Study, alpha_lines
+from music_rllib.results.study import Study
 
 FINALS = {names.EVAL_SUCCESS: "Final success rate", names.EVAL_RETURN: "Final return"}
 AGAINST_ENTROPY = "Performance against entropy"
@@ -57,9 +65,7 @@ _GROUP_OF = {
 PRIMARY = tuple(metric.title for metric in METRICS[:2])
 """Titles of the curves of primary metrics: success rate and return."""
 OF_ALL_STAGES = tuple(
-    metric
-    for metric in METRICS
-    if metric.title in PRIMARY or metric.name == names.EVAL_DISPLACEMENT
+    one for one in METRICS if one.title in PRIMARY or one.name == names.EVAL_DISPLACEMENT
 )
 """Curves that are drawn of all stages together; displacement shows an effect before success."""
 MOST_FACETS = 8

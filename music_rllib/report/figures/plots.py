@@ -23,13 +23,13 @@ from matplotlib.ticker import EngFormatter, LogFormatter
 
 from music_rllib import names
 from music_rllib.results import statistics as st
-from music_rllib.results.analysis import RATE_LIMITS, Curve, FinalScores, Metric, Scope
+from music_rllib.results.analysis import RATE_LIMITS, AlphaLine, Curve, FinalScores, Metric, Scope
 from music_rllib.results.claims import Claim
 from music_rllib.results.conditions import Condition
 from music_rllib.results.data import Sweep
 from music_rllib.results.scores import measure_on, scores_of
 from music_rllib.results.statistics import SHOW_SEEDS_BELOW, Array, Estimate
-from music_rllib.results.study import AlphaLine, Mean
+from music_rllib.results.study import Mean
 
 LIGHT, DARK = "#ffffff", "#14171c"
 """Background of the page in light and in dark mode."""

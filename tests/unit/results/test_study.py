@@ -19,7 +19,7 @@ from music_rllib import names
 from music_rllib.experiment.plan import make_plan
 from music_rllib.report.figures.choice import drawings_of_stages, study_drawings
 from music_rllib.report.figures.draw import files
-from music_rllib.results.analysis import curve
+from music_rllib.results.analysis import alpha_lines, curve
 from music_rllib.results.analysis_plan import (
     AnalysisPlan,
     PlanVersion,
@@ -41,7 +41,7 @@ from music_rllib.results.statistics import (
     p_text,
     seeds_needed,
 )
-from music_rllib.results.study import Study, alpha_lines, study_of
+from music_rllib.results.study import Study, study_of
 from music_rllib.results.tables import study_tables
 from music_rllib.sweep.views.results import console_table
 from tests.sweep_files import loaded
