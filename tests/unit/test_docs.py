@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -12,6 +13,7 @@ from docs.generate_configuration import TARGET, document, json_schema
 from music_rllib import names
 from music_rllib.config.document import SCHEMA
 from music_rllib.config.load import load_config
+from music_rllib.config.tac_settings import TACSettings, setting_text
 from music_rllib.envs.tasks import BUILT_IN_TASKS
 from music_rllib.results.analysis_plan import analysis_plan
 
@@ -66,6 +68,20 @@ METRICS = {
     and isinstance(value, str)
     and not key.startswith(("TAG_", "KIND_", "ARTIFACT_", "VARIABLE_", "CURRENT", "SUPERSEDED"))
 }
+
+
+@pytest.mark.parametrize(
+    "alpha",
+    [
+        {"value": 0.05, "matched_width": 0.1},
+        {"learned": True, "target_shannon": -4.0},
+        {"learned": True, "target_width": 0.1},
+        {"learned": True, "target_entropy": -4.0},
+    ],
+)
+def test_a_hypothesis_names_each_kind_of_alpha_as_the_page_says(alpha: dict[str, Any]) -> None:
+    words = setting_text(TACSettings.model_validate({"alpha": alpha}).alpha)
+    assert f"`alpha = {words}`" in " ".join(TEXTS["comparing_q.md"].split())
 
 
 def test_every_metric_is_described() -> None:
