@@ -105,11 +105,10 @@ def measure_on(
         until: As in `Measure`.
     """
     own = [run for run in runs if sweep.runs[run].task == task]
-    least = sweep.least_budget(task, own)
     measure = Measure(
         kind=kind,
         metric=metric or sweep.primary_metric(task),
-        horizon=min(horizon, least),
+        horizon=min(horizon, sweep.least_budget(task, own)),
         maximised=maximised,
         until=until or {},
     )
