@@ -44,7 +44,7 @@ from music_rllib.results.answer import claim_rows, mean_rows
 from music_rllib.results.conditions import StageRuns
 from music_rllib.results.data import ReportError, Sweep
 from music_rllib.results.statistics import Array
-from music_rllib.results.study import study_of
+from music_rllib.results.study import Study, study_of
 from music_rllib.results.tables import performance_tables, to_csv
 
 PAGE = "report.html"
@@ -119,8 +119,16 @@ def build_report(
         differences=() if both is None else difference_tables(*both, analyses),
         limitations=[*sentences, *filter(None, [damaged])],
         command=command,
-        videos=make_videos(sweep, analyses, storage, environments) if videos else Videos(),
+        videos=make_videos(sweep, of_the_answer(analyses, studies[""]), storage, environments)
+        if videos
+        else Videos(),
     )
+
+
+def of_the_answer(analyses: Sequence[StageAnalysis], study: Study) -> Sequence[StageAnalysis]:
+    """The stage of the answer, or the last one if the answer has none."""
+    asked = [one for one in analyses if study.stage and one.stage.name == study.stage.name]
+    return asked or analyses[-1:]
 
 
 def _without_chance(drawings: Iterator[Drawing], stages: Sequence[StageRuns]) -> Iterator[Drawing]:

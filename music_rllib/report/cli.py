@@ -287,20 +287,22 @@ MOST_NOTE = 7500
 
 
 def _note(answer: str, made: SweepReport, run_id: str) -> str:
-    """The answer, the last stage's final values and a figure, in Markdown for MLflow's page."""
+    """The answer, its stage's final values and a figure, in Markdown for MLflow's page."""
+    from music_rllib.report.build import of_the_answer
     from music_rllib.results.tables import performance_tables
 
     lines = [f"**{_escaped(answer)}**", ""]
-    last = ""
+    stage = ""
     if made.analyses:
-        last = made.analyses[-1].stage.name
-        table = performance_tables(made.analyses[-1:])[0]
+        own = of_the_answer(made.analyses, made.study)
+        stage = own[0].stage.name
+        table = performance_tables(own)[0]
         titles = [title for title, _ in table.heads]
         rows = [titles, *([cell.text for cell in row] for row in table.cells)]
         # MLflow's tables have no space between their columns.
         lines += ["".join(f"| {_escaped(text)}&emsp;" for text in row) + "|" for row in rows]
         lines.insert(3, "|---" * len(titles) + "|")
-    drawn = sorted(made.drawings, key=lambda drawing: drawing.stage != last)
+    drawn = sorted(made.drawings, key=lambda drawing: drawing.stage != stage)
     count = len(lines)
     # MLflow would cut off the end, which is the figure.
     while sum(map(len, lines)) + len(lines) > MOST_NOTE and len(lines) > 4:

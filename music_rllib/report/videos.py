@@ -58,7 +58,7 @@ def make_videos(
     storage: str | None,
     environments: Sequence[Task] = (),
 ) -> Videos:
-    """Record the last stage's policies on the built-in tasks and in the user's `environments`.
+    """Record policies of the last of these stages on built-in tasks and the user's `environments`.
 
     It never fails: the result has the reason why a video is missing. An exported sweep has no
     `storage` with policies.

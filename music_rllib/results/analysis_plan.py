@@ -11,6 +11,7 @@ Texts of a plan are part of its hash, so existing ones must not change.
 
 from __future__ import annotations
 
+import contextlib
 import re
 import time
 from collections.abc import Collection, Hashable, Mapping, Sequence
@@ -347,8 +348,8 @@ def record_plan(
     show other seeds and budgets, which count when they are run.
 
     Returns:
-        All versions; and the hypotheses of a new one about stages with a finished run, without
-        those that an earlier version had.
+        All versions; and the hypotheses of a new one that neither the version before it has, with
+        the same test, nor the last one before the first result of their stages.
 
     Raises:
         StorageError: The plan can't be written, or earlier versions can't be read.
@@ -364,13 +365,29 @@ def record_plan(
         return versions, ()
     sweep.location.keep(ANALYSIS_PLAN, as_json(as_document(versions)))
     sweep.location.keep(PLANS_TO_READ, as_markdown(sweep.config.name, versions))
-    shown = results_of_other_budgets(sweep)
-    done = {
-        node.stage for node in sweep.plan.nodes if node.key in sweep.finished or node.key in shown
-    }
-    known = [one.plan for one in before if plan.has_same_test(one.plan)]
-    return versions, tuple(
-        hypothesis.text
-        for hypothesis in plan.planned
-        if hypothesis.stages & done and not any(hypothesis in one.planned for one in known)
-    )
+    first = _first_results(sweep)
+
+    def is_known(hypothesis: PlannedHypothesis) -> bool:
+        time = min(first.get(stage, np.inf) for stage in hypothesis.stages)
+        in_time = [one for one in versions if one.recorded_ms < time][-1:]
+        return any(
+            hypothesis in one.plan.planned and plan.has_same_test(one.plan)
+            for one in (*in_time, *before[-1:])
+        )
+
+    return versions, tuple(one.text for one in plan.planned if not is_known(one))
+
+
+def _first_results(sweep: OpenSweep) -> dict[str, int]:
+    """Stage to the time of its first result in ms, also of runs with other `env_steps`."""
+    stages = {node.key: node.stage for node in sweep.plan.nodes}
+    searched = {stage.name for stage in sweep.plan.searched}
+    for one in sweep.recorded.get("nodes", ()):  # the plan does not have a search's trials yet
+        if (stage := one["label"].partition("/")[0]) in searched:
+            stages[one["key"]] = stage
+    shown = results_of_other_budgets(sweep).items()
+    times = [(stages[key], int(tags[names.TAG_EARLIER_RESULT])) for key, tags in shown]
+    for key in sweep.store.finished(stages):
+        with contextlib.suppress(StorageError):  # the result of a damaged run is not known
+            times.append((stages[key], sweep.store.history(key)[-1].timestamp_ms))
+    return {stage: min(time for one, time in times if one == stage) for stage, _ in times}

@@ -210,7 +210,7 @@ def _reader(
             run = replace(run, tags={**run.tags, names.TAG_PRUNED: "by the search"})
         if (cause := causes.get(node.key)) is not None:
             run = replace(run, status="FAILED", tags={**run.tags, names.TAG_FAILURE: cause})
-        elif node.key in begun:
+        elif node.key in begun or node.key in pruned:
             is_running = is_alive and node.key not in pruned
             run = replace(run, status="RUNNING" if is_running else "KILLED")
         if node.key not in begun:

@@ -82,6 +82,7 @@ def state_of(location: SweepLocation) -> dict[str, Any]:
     from music_rllib.config.schema import IMPORTED
     from music_rllib.experiment import sweep_files
     from music_rllib.experiment.record import earlier_text
+    from music_rllib.experiment.scheduler import DONE
     from music_rllib.store.node_store import NodeStore
     from music_rllib.sweep.driver_lock import others_drive
 
@@ -104,10 +105,13 @@ def state_of(location: SweepLocation) -> dict[str, Any]:
     damaged = [
         {"run": labels[key], "cause": str(error)} for key, error in store.damage(labels).items()
     ]
+    counted = (stage["runs"].get(name, 0) for stage in state["stages"] for name in DONE)
+    since = sum(node["key"] in finished for node in nodes) - sum(counted)
     return {
         "place": location.place,
         "state": outcome,
         **state,
+        "finished_since": 0 if outcome == "running" else max(since, 0),
         "damaged": damaged,
         "earlier": earlier_text(location),
     }

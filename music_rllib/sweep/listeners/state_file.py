@@ -200,13 +200,10 @@ class StateFile(Listener):
         ]
         searches = self.searches()
         # Without the task's reward, success is chance; with a single setting, there is no best.
-        compared = [
-            stage
-            for stage in sweep.config.stages
-            if VARIANTS[stage.variant].fixed["task_reward"]
-            and (stage.search is not None or trials[stage.name] > 1)
-        ]
+        rewarded = [s for s in sweep.config.stages if VARIANTS[s.variant].fixed["task_reward"]]
+        varied = {s.name for s in rewarded if s.search is not None or trials[s.name] > 1}
         chosen = sweep.config.stage().name  # the stage of `best` comes first, then the last one
+        compared = [s for s in rewarded if varied and s.name in {*varied, chosen}]
         compared.sort(key=lambda stage: stage.name == chosen)
         now, to_come = self._last_values.sweep(self._results), self._to_come(searches)
         self._state = {

@@ -171,6 +171,12 @@ def _progress_lines(state: Mapping[str, Any]) -> Iterator[str]:
     more = env_steps.get("to_come")
     searched = f", at most {more:,} more if the searches need them" if more else ""
     yield f"Budget: {env_steps['done']:,} env steps done, {env_steps['left']:,} left{searched}"
+    if since := state["finished_since"]:
+        are = "more run is" if since == 1 else "more runs are"
+        yield (
+            f"{since} {are} finished in the storage since then. Compare, report and best show "
+            "them; the next run counts them here."
+        )
     if state["earlier"] is not None:
         yield state["earlier"]
     if state["best"] is not None:

@@ -9,10 +9,13 @@ from typing import Any
 import pytest
 import yaml
 
+from music_rllib.experiment.open_sweep import OpenSweep
 from music_rllib.experiment.plan import make_plan
 from music_rllib.program import main
 from music_rllib.results.analysis_plan import analysis_plan, plans_in, record_plan
 from music_rllib.results.study import untestable
+from music_rllib.sweep.listeners.state_file import StateFile
+from tests import played_search
 from tests.played_sweep import (
     ASKED,
     document,
@@ -307,3 +310,39 @@ def test_final_values_by_a_plan_without_the_steps_of_each_stage(
         planned_and_played(tmp_path, content)
     words = [claim.measure.words for claim in studied(tmp_path).planned]
     assert words == ["final success", "final success"]
+
+
+def test_plan_names_the_hypotheses_that_the_answer_calls_late(tmp_path: Path) -> None:
+    one, two = "q = 2 worse than q = 1", "q = 2 against q = 1"
+
+    def said(*hypotheses: str) -> tuple[OpenSweep, tuple[str, ...]]:
+        sweep = opened(tmp_path, document(analysis={"hypotheses": list(hypotheses)}))
+        time.sleep(0.01)
+        return sweep, record_plan(sweep)[1]
+
+    assert said(one, two)[1] == ()
+    sweep, late = said(two)
+    assert late == ()
+    play(sweep, int(time.time() * 1000) + 1)
+    assert said(one, two)[1] == studied(tmp_path).late == (one,)
+
+
+def test_plan_names_late_hypotheses_about_a_search(tmp_path: Path) -> None:
+    search = {
+        "mode": "compare",
+        "compare": {"tac.entropic_index": [1.0, 2.0]},
+        "space": {"tac.alpha": {"choice": [0.05, 0.2]}},
+        "trials": 1,
+        "startup_trials": 1,
+        "final": {"trials": 1, "seeds": 5},
+    }
+    content = played_search.document(
+        {}, stages=[{"name": "tuned", "variant": "tac", "search": search}]
+    )
+    driver = played_search.Driver(tmp_path, content)
+    with StateFile(driver.sweep) as state_file:
+        driver.play()
+        state_file.end("finished")
+    text = "q = 2 against q = 1"
+    sweep = opened(tmp_path, content | {"analysis": {"hypotheses": [text]}})
+    assert record_plan(sweep)[1] == (text,)

@@ -17,6 +17,8 @@ from music_rllib.experiment.open_sweep import continued_runs_text, open_sweep
 from music_rllib.experiment.plan import make_plan, remarks
 from music_rllib.experiment.record import changes_since
 from music_rllib.program import main
+from music_rllib.report.build import build_report
+from music_rllib.report.cli import _note
 from music_rllib.results.analysis_plan import record_plan
 from music_rllib.results.archive import read_archive, write_archive
 from music_rllib.results.read import read_sweep
@@ -25,8 +27,10 @@ from music_rllib.store.handoff import Spaces, write_handoff
 from music_rllib.sweep.preflight import check_environments
 from music_rllib.sweep.views.compare import compare_stage
 from tests.played_sweep import (
+    ASKED,
     document,
     opened,
+    planned_and_played,
     play,
 )
 from tests.sweep_files import loaded
@@ -66,15 +70,42 @@ def test_status_and_best_choose_the_same_stage(
 ) -> None:
     grid = {"tac.entropic_index": [1.0, 2.0]}
     first: dict[str, Any] = {"name": "first", "variant": "tac", "grid": grid}
-    stages = [first, first | {"name": "last", "tac": {"lr": 0.002}}]
+    alone = {"name": "last", "variant": "tac", "tac": {"lr": 0.002}}
     analysis = {"hypotheses": ["q = 2 against q = 1"], "stage": "first"}
-    play(opened(tmp_path, document(stages, analysis=analysis)), 1)
-    found = []
-    for command in ("status", "best"):
-        assert main([command, str(tmp_path / "results/s"), "--json"]) == 0
-        answer = json.loads(capsys.readouterr().out)
-        found.append((answer["best"] if command == "status" else answer)["stage"])
-    assert found == ["first", "first"]
+    for last, changes, chosen in (
+        (alone | {"grid": grid}, {"analysis": analysis}, "first"),
+        (alone, {}, "last"),
+    ):
+        (tmp_path / chosen).mkdir()
+        play(opened(tmp_path / chosen, document([first, last], **changes)), 1)
+        found = []
+        for command in ("status", "best"):
+            assert main([command, str(tmp_path / chosen / "results/s"), "--json"]) == 0
+            answer = json.loads(capsys.readouterr().out)
+            found.append((answer["best"] if command == "status" else answer)["stage"])
+        assert found == [chosen, chosen]
+
+
+def test_status_names_runs_that_another_sweep_has_finished(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first = opened(tmp_path, document())
+    play(first, 1, nodes=list(first.plan.nodes)[:4])
+    other = opened(tmp_path, document(name="other"))
+    play(other, 1, nodes=[node for node in other.plan.nodes if node.key not in other.finished])
+    assert main(["status", str(first.folder)]) == 0
+    assert "6 more runs are finished in the storage since then" in capsys.readouterr().out
+
+
+def test_the_note_in_mlflow_has_the_conditions_of_its_answer(tmp_path: Path) -> None:
+    grid = {"name": "grid", "variant": "tac", "grid": {"tac.entropic_index": [1.0, 2.0]}}
+    alone = {"name": "alone", "variant": "tac", "tasks": ["FetchSlide"], "tac": {"lr": 0.002}}
+    planned_and_played(tmp_path, document([grid, alone], analysis=ASKED | {"stage": "grid"}))
+    made = build_report(read_sweep(str(tmp_path / "results/s")).sweep)
+    note = _note(made.answer[1], made, "0" * 32)
+    assert "| q = 2&emsp;|" in note
+    assert "grid-success-rate" in note
+    assert "FetchSlide" not in note
 
 
 @pytest.mark.parametrize(

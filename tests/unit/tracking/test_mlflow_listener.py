@@ -213,6 +213,7 @@ def test_a_long_description_keeps_its_figure(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(tables, "performance_tables", lambda _: [table])
     made: Any = SimpleNamespace(
         analyses=[SimpleNamespace(stage=SimpleNamespace(name="train"))],
+        study=SimpleNamespace(stage=None),
         drawings=[SimpleNamespace(stage="train", name="curves")],
     )
     note = _note("**the answer**", made, "0" * 32)
