@@ -34,7 +34,7 @@ FEWEST_FOR_SPREAD = 3
 
 
 def answer(sweep: Sweep, study: Study) -> list[str]:
-    """At most ten sentences: question, verdicts, metric, seeds and control."""
+    """At most eleven sentences: question, verdicts, metric, seeds and control."""
     planned = planned_in_words(study)
     sentences = [f"{planned[0].upper()}{planned[1:]}."]
     if study.question is not None:

@@ -276,11 +276,12 @@ def matching(
     """Conditions that may be compared and have all settings of one side of a hypothesis."""
     settings = dict(side)
     chosen = stages.get(settings.pop("stage", stage))
-    return [
-        condition
-        for condition in (chosen.compared if chosen else ())
-        if all(_has(sweep.runs[condition.runs[0]], *setting) for setting in settings.items())
-    ]
+
+    def has_all(condition: Condition) -> bool:
+        of_tasks = {sweep.runs[run].task: sweep.runs[run] for run in condition.runs}
+        return all(_has(run, *one) for run in of_tasks.values() for one in settings.items())
+
+    return [one for one in (chosen.compared if chosen else ()) if has_all(one)]
 
 
 def _has(run: RunRecord, name: str, value: str) -> bool:

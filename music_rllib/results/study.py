@@ -292,13 +292,14 @@ def _of_plan(
     Fills `untested` with reasons and the number of comparisons that can't be tested.
     """
     plan = version.plan
-    sweep = counted(sweep, plan.metric) if hypotheses else sweep
+    as_set, sweep = sweep, counted(sweep, plan.metric) if hypotheses else sweep
     for key in hypotheses:
         hypothesis = _in_full(key.text, version, sweep.plans[-1])
         tasks = _tasks_of_all(sweep, key.stages, plan.budget.keys())
         scopes = _scopes(tasks, {sweep.primary_metric(task) for task in tasks})
         sides = (hypothesis.first, hypothesis.second)
-        first, second = (matching(sweep, stages, side, plan.stage) for side in sides)
+        # `counted` changes the runs' env_steps, which a hypothesis can name.
+        first, second = (matching(as_set, stages, side, plan.stage) for side in sides)
         pairs = pairs_of_hypothesis(first, second, hypothesis)
         if isinstance(pairs, str):
             untested[f"{hypothesis.text}: {pairs}"] = scopes

@@ -346,3 +346,38 @@ def test_plan_names_late_hypotheses_about_a_search(tmp_path: Path) -> None:
     text = "q = 2 against q = 1"
     sweep = opened(tmp_path, content | {"analysis": {"hypotheses": [text]}})
     assert record_plan(sweep)[1] == (text,)
+
+
+@pytest.mark.parametrize("steps", [2000, 4000])
+def test_a_hypothesis_names_the_steps_of_its_own_stage_with_auc_total(
+    tmp_path: Path, steps: int
+) -> None:
+    """Not those with the pretraining, which are 4,000 for the runs of 2,000 steps."""
+    grid = {"tac.entropic_index": [1.0, 2.0], "env_steps": [2000, 4000]}
+    tune = {"name": "r", "variant": "music-r", "init_from": "u", "grid": grid}
+    stages: list[dict[str, Any]] = [{"name": "u", "variant": "music-u"}, tune]
+    text = f"q = 2, env_steps = {steps} against q = 1, env_steps = {steps}"
+    analysis = {"hypotheses": [text], "metric": "auc_total"}
+    planned_and_played(tmp_path, document(stages, analysis=analysis))
+    (claim,) = studied(tmp_path).planned
+    ((first, second),) = claim.pairs
+    assert first.label == f"q = 2, env_steps = {steps}"
+    assert second.label == f"q = 1, env_steps = {steps}"
+
+
+def test_a_hypothesis_does_not_name_the_setting_of_one_task_only(tmp_path: Path) -> None:
+    stage = {
+        "name": "her",
+        "variant": "tac",
+        "tac": {"alpha": 0.05},
+        "per_task": {"FetchSlide": {"tac": {"alpha": 0.1}}},
+        "grid": {"tac.entropic_index": [1.0, 2.0]},
+    }
+    asked = {"hypotheses": ["q = 2, alpha = 0.05 worse than q = 1, alpha = 0.05"]}
+    content = document([stage], tasks=["FetchPush", "FetchSlide"], analysis=asked)
+    config = loaded(tmp_path, content)
+    plan = analysis_plan(config)
+    assert plan is not None
+    assert len([*untestable(make_plan(config), plan)]) == 1
+    planned_and_played(tmp_path, content)
+    assert studied(tmp_path).planned == ()
