@@ -236,7 +236,7 @@ def _alike(shown: Sequence[Claim]) -> list[Claim]:
 def _seeds(sweep: Sweep, study: Study, shown: Sequence[Claim]) -> str:
     finished = sum(sweep.runs[run].is_finished for run in study.runs)
     metrics = {mean.task: mean.measure.metric for mean in study.means}
-    failed = sum(has_failed(sweep, run, metrics.get(sweep.runs[run].task)) for run in study.runs)
+    ends = [run for run in study.runs if has_failed(sweep, run, metrics.get(sweep.runs[run].task))]
     counts = sorted({n for one in shown for n in one.contrast.seeds})
     if not counts:
         counts = sorted({len(one.scores.by_seed) for one in study.means})
@@ -249,9 +249,10 @@ def _seeds(sweep: Sweep, study: Study, shown: Sequence[Claim]) -> str:
     if study.stage is not None and study.stage.is_search:
         text += ", not used for selection"
     text += f"; {finished} of {len(study.runs)} runs finished."
-    if failed:
-        runs = "1 failed run counts" if failed == 1 else f"{failed} failed runs count"
-        text += f" {runs} with the worst value of the metric."
+    if ends:
+        how = "failed or diverged" if any(sweep.runs[run].is_finished for run in ends) else "failed"
+        runs = "run counts" if len(ends) == 1 else "runs count"
+        text += f" {len(ends)} {how} {runs} with the worst value of the metric."
     return text
 
 

@@ -660,9 +660,12 @@ def test_a_failed_run_has_the_smallest_return_or_the_worst_observed(
     sweep = sweep_of(
         [*runs, (replace(runs[0][0], tags={**runs[0][0].tags, names.TAG_SEED: "9"}), diverged)]
     )
-    (mean,) = study_of(sweep).means
+    found = study_of(sweep)
+    (mean,) = found.means
     assert mean.scores.by_seed["9"] == worst
     assert len(mean.scores.by_seed) == 7
+    said = " ".join(answer(sweep, found))
+    assert "7 of 7 runs finished. 1 failed or diverged run counts with the worst value" in said
 
 
 def test_a_failed_run_has_one_score_in_a_report() -> None:
