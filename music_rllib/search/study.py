@@ -340,6 +340,14 @@ def _first_points(
     if settings.sampler == "grid" or not older:
         return given
     trials = storage.get_all_trials(max(older), deepcopy=False)
+    # The sampler chose the rest of a point that is given in part: it keeps these values.
+    chosen = [values for trial in trials[: len(given)] if (values := trial.user_attrs.get(VALUES))]
+    chosen = [v for v in chosen if fits(v, settings) and not any(same(v, one) for one in given)]
+    for at, point in enumerate(given):
+        whole = (v for v in chosen if all(k in v and same(v[k], point[k]) for k in point))
+        if not fits(point, settings) and (values := next(whole, None)) is not None:
+            given[at] = values
+            chosen.remove(values)
     # It may have been stopped before it evaluated the points that it took over itself.
     earlier = list(storage.get_study_user_attrs(max(older))[POINTS])
     earlier += [trial.user_attrs.get(VALUES) for trial in trials if trial.state.is_finished()]

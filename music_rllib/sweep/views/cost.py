@@ -98,11 +98,13 @@ def searched_runs(config: SweepConfig, stage: Stage) -> list[RunGroup]:
     for fresh, (trials, seeds, env_steps) in enumerate(phases):
         source = config.source_of(stage)
         while source is not None:
-            points = _points_of(search, source.name)
             # A source whose settings are not searched has its other runs in the plan.
-            count = min(trials * studies, points) if fresh or points > 1 else 0
+            searched = any(name.startswith(f"{source.name}:") for name in _varied(search))
+            most = min(trials * studies, _points_of(search, source.name))
+            count = int(most) if fresh or searched else 0
             for task, run in source.points[0].runs.items():
-                runs[source.name, task, run.env_steps] += count * seeds
+                longest = _most_env_steps(search, source.name, run.env_steps)
+                runs[source.name, task, longest] += count * seeds
             source = config.source_of(source)
         for task in stage.points[0].runs:
             runs[stage.name, task, env_steps] += trials * studies * seeds
@@ -118,15 +120,30 @@ def searched_runs(config: SweepConfig, stage: Stage) -> list[RunGroup]:
     ]
 
 
-def _points_of(search: SearchSettings, stage: str) -> int:
+def _varied(search: SearchSettings) -> tuple[str, ...]:
+    return (*search.space, *search.compare)
+
+
+def _points_of(search: SearchSettings, stage: str) -> float:
     """The largest number of points that a search has in the settings of another stage."""
-    names = [name for name in (*search.space, *search.compare) if name.startswith(f"{stage}:")]
-    return math.prod(
-        len(search.compare[name])
-        if name in search.compare
-        else search.space[name].size or search.count
-        for name in names
-    )
+    sizes: list[float] = []
+    for name in _varied(search):
+        if not name.startswith(f"{stage}:"):
+            continue
+        if name in search.compare:
+            sizes.append(len(search.compare[name]))
+        else:  # while a condition does not hold, the stage has its own value
+            dimension = search.space[name]
+            sizes.append((dimension.size or math.inf) + bool(dimension.when))
+    return math.prod(sizes)
+
+
+def _most_env_steps(search: SearchSettings, stage: str, own: int) -> int:
+    """The longest budget of another stage in a search; `own` is the stage's budget."""
+    name = f"{stage}:env_steps"
+    if (dimension := search.space.get(name)) is not None:
+        return max(*map(int, dimension.ends()), own if dimension.when else 0)
+    return max((int(float(str(steps))) for steps in search.compare.get(name, ())), default=own)
 
 
 def measure(

@@ -793,6 +793,22 @@ def test_the_same_file_gives_the_same_points_on_another_machine(tmp_path: Path) 
     assert not any(point in FIRST_POINTS for point in by_chance[3:]), "those are TPE's"
 
 
+def test_more_seeds_keep_all_points_if_some_are_given_in_part(tmp_path: Path) -> None:
+    def formula(run: RunSettings, share: float) -> float:
+        """The seeds prefer different values of q."""
+        q, seed = float(run.tac.entropic_index), run.seed  # type: ignore[arg-type]
+        return round(0.8 * share - 0.3 * abs(q - (1.0, 2.5)[seed]) * (1 + 2 * seed), 6)
+
+    given = [{"tac.entropic_index": 1.0}, {"tac.entropic_index": 2.0}]
+    search = {"points_to_evaluate": given, "trials": 8}
+    before = Driver(tmp_path, document(search, seeds=[0]), formula)
+    before.play()
+    after = Driver(tmp_path, document(search, seeds=[0, 1]), formula)
+    after.play()
+    assert points(after.trials()) == points(before.trials())
+    assert len(after.computed) == 1 + 8, "only the new seed"
+
+
 def test_node_keys_are_the_same_in_another_process(tmp_path: Path) -> None:
     driver = Driver(tmp_path, document({"trials": 2}))
     driver.play()

@@ -111,3 +111,49 @@ def test_runs_that_no_memory_holds_side_by_side_are_told_of(
     monkeypatch.setattr(machine, "memory", lambda: here * 2**30)
     view = cost.cost_view(costs(tmp_path, slots=4))
     assert any(told in str(line) for line in view.renderables)
+
+
+@pytest.mark.parametrize(
+    ("search", "runs", "env_steps"),
+    [
+        (  # each compared value has its own points of a range
+            {
+                "mode": "compare",
+                "compare": {"tac.entropic_index": [1.0, 1.5, 2.0]},
+                "space": {"u:tac.alpha": {"float": [0.01, 0.1]}},
+            },
+            3 * 4 * 2,
+            10_000,
+        ),
+        (  # without the setting, the stage has its own value
+            {
+                "space": {
+                    "tac.bootstrap": {"choice": ["value", "critics"]},
+                    "u:tac.alpha": {"choice": [0.1, 0.3], "when": {"tac.bootstrap": "critics"}},
+                }
+            },
+            3 * 2,
+            10_000,
+        ),
+        (
+            {"space": {"tac.alpha": {"choice": [0.1, 0.3]}, "u:tac.alpha": {"choice": [0.3]}}},
+            1 * 2,
+            10_000,
+        ),
+        ({"space": {"u:env_steps": {"choice": [10_000, 20_000]}}}, 2 * 2, 20_000),
+    ],
+)
+def test_no_more_sources_are_trained_than_the_plan_says(
+    search: dict[str, Any], runs: int, env_steps: int, tmp_path: Path
+) -> None:
+    stages = [
+        {"name": "u", "variant": "music-u"},
+        {
+            "name": "r",
+            "variant": "music-r",
+            "init_from": "u",
+            "search": {"trials": 4, "final": None} | search,
+        },
+    ]
+    found = kinds(tmp_path, tasks=["FetchPush"], stages=stages)
+    assert [(one.runs, one.env_steps) for one in found if one.stage == "u"] == [(runs, env_steps)]
