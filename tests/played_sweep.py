@@ -97,3 +97,10 @@ def stages_of(short: int, long: int) -> list[dict[str, Any]]:
     base = document()["stages"][0]
     first = base | {"name": "short", "tac": {"lr": 0.002}, "env_steps": short}
     return [first, base | {"name": "long", "env_steps": long}]
+
+
+def with_alpha_of_each_task(**changes: Any) -> dict[str, Any]:
+    """`document` on two tasks, with α = 0.05 on FetchPush and 0.1 on FetchSlide."""
+    per_task = {"FetchSlide": {"tac": {"alpha": 0.1}}}
+    stage = document()["stages"][0] | {"tac": {"alpha": 0.05}, "per_task": per_task}
+    return document([stage], tasks=["FetchPush", "FetchSlide"], **{"analysis": ASKED} | changes)

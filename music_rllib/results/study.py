@@ -234,17 +234,23 @@ def _plan_on(
     """The plan whose steps count on a task; if it was added, the last one before its results."""
     if task in version.plan.budget:
         return version.plan
-    runs = (run for name in key.stages & stages.keys() for run in stages[name].runs)
-    time = first_result(sweep, (run for run in runs if sweep.runs[run].task == task))
     added = [
         one.plan
-        for one in sweep.plans
-        if one.recorded_ms < time
-        and one.plan.metric == version.plan.metric
+        for one in _before_results(sweep, stages, key, task)
+        if one.plan.metric == version.plan.metric
         and task in one.plan.budget
         and key.stages <= one.plan.stages
     ]
     return added[-1] if added else version.plan
+
+
+def _before_results(
+    sweep: Sweep, stages: Mapping[str, StageRuns], key: PlannedHypothesis, task: str | None = None
+) -> list[PlanVersion]:
+    """The versions from before the first result of a hypothesis's stages, on a task or on any."""
+    runs = (run for name in key.stages & stages.keys() for run in stages[name].runs)
+    time = first_result(sweep, (run for run in runs if task in (None, sweep.runs[run].task)))
+    return [version for version in sweep.plans if version.recorded_ms < time]
 
 
 def _runs(stage: StageRuns) -> list[int]:
@@ -262,10 +268,7 @@ def _planned_in_time(
     """
     found: dict[PlannedHypothesis, PlanVersion] = {}
     for key in dict.fromkeys(key for one in sweep.plans for key in one.plan.planned):
-        runs = (run for name in key.stages & stages.keys() for run in stages[name].runs)
-        time = first_result(sweep, runs)
-        before = [version for version in sweep.plans if version.recorded_ms < time]
-        for version in before[-1:]:
+        for version in _before_results(sweep, stages, key)[-1:]:
             found |= {one: version for one in version.plan.planned if one == key}
     return found
 

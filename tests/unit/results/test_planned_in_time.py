@@ -25,6 +25,7 @@ from tests.played_sweep import (
     play,
     stages_of,
     studied,
+    with_alpha_of_each_task,
 )
 from tests.sweep_files import loaded
 
@@ -366,15 +367,8 @@ def test_a_hypothesis_names_the_steps_of_its_own_stage_with_auc_total(
 
 
 def test_a_hypothesis_does_not_name_the_setting_of_one_task_only(tmp_path: Path) -> None:
-    stage = {
-        "name": "her",
-        "variant": "tac",
-        "tac": {"alpha": 0.05},
-        "per_task": {"FetchSlide": {"tac": {"alpha": 0.1}}},
-        "grid": {"tac.entropic_index": [1.0, 2.0]},
-    }
     asked = {"hypotheses": ["q = 2, alpha = 0.05 worse than q = 1, alpha = 0.05"]}
-    content = document([stage], tasks=["FetchPush", "FetchSlide"], analysis=asked)
+    content = with_alpha_of_each_task(analysis=asked)
     config = loaded(tmp_path, content)
     plan = analysis_plan(config)
     assert plan is not None

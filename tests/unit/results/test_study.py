@@ -44,6 +44,7 @@ from music_rllib.results.statistics import (
 from music_rllib.results.study import Study, study_of
 from music_rllib.results.tables import study_tables
 from music_rllib.sweep.views.results import console_table
+from tests import played_sweep
 from tests.sweep_files import loaded
 
 BUDGET = 10_000
@@ -1205,22 +1206,7 @@ def test_a_metric_that_no_run_reported_is_no_failure() -> None:
 
 
 def test_an_alpha_of_each_task_is_not_averaged_over(tmp_path: Path) -> None:
-    stage = {
-        "name": "train",
-        "variant": "tac",
-        "tac": {"alpha": 0.05},
-        "per_task": {"FetchSlide": {"tac": {"alpha": 0.1}}},
-        "grid": {"tac.entropic_index": [1.0, 1.5]},
-    }
-    document = {
-        "name": "s",
-        "tasks": ["FetchPush", "FetchSlide"],
-        "seeds": [0, 1, 2, 3, 4],
-        "defaults": {"env_steps": 2000},
-        "analysis": {"hypotheses": ["q = 1.5 against q = 1"]},
-        "stages": [stage],
-    }
-    plan = analysis_plan(loaded(tmp_path, document))
+    plan = analysis_plan(loaded(tmp_path, played_sweep.with_alpha_of_each_task()))
     assert plan is not None
     text = "α of its own for each task: 0.05 on FetchPush, 0.1 on FetchSlide"
     assert plan.control == text
