@@ -100,6 +100,11 @@ class StageRuns:
         return tuple(one for one in self.conditions if (SEEDS, SEARCHED) not in one.others)
 
     @property
+    def compared_runs(self) -> list[int]:
+        """The runs of `compared`."""
+        return [run for condition in self.compared for run in condition.runs]
+
+    @property
     def has_task_reward(self) -> bool:
         return self.variant not in {"music-u", "intrinsic-u"}
 
