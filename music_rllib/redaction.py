@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Mapping
+from functools import lru_cache
 
 MAX_PARAM_LENGTH = 6000
 """Longest value of an MLflow param, in characters."""
@@ -140,9 +141,16 @@ def without_secrets(
 
 
 def _is_secret(key: str, value: object) -> bool:
-    if isinstance(value, int | float):
-        key = _COUNTED_KEY.sub("", key)
-    return _SECRET_KEY.search(key) is not None
+    return _names_a_secret(key, counted=isinstance(value, int | float))
+
+
+# The runs of a sweep have the same names and nearly the same values of settings.
+@lru_cache(maxsize=4096)
+def _names_a_secret(key: str, *, counted: bool) -> bool:
+    return _SECRET_KEY.search(_COUNTED_KEY.sub("", key) if counted else key) is not None
+
+
+_redacted = lru_cache(maxsize=4096)(redact)
 
 
 def _clean(path: tuple[str, ...], value: object) -> object:
@@ -153,8 +161,8 @@ def _clean(path: tuple[str, ...], value: object) -> object:
     if not isinstance(value, str):
         return value
     if _names_a_class(path) and _CLASS.fullmatch(value):
-        return ":".join(map(redact, value.split(":")))
-    return redact(value)
+        return ":".join(map(_redacted, value.split(":")))
+    return _redacted(value)
 
 
 def _names_a_class(path: tuple[str, ...]) -> bool:

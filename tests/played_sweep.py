@@ -19,8 +19,8 @@ from tests.sweep_files import loaded
 
 
 def document(stages: list[dict[str, Any]] | None = None, **changes: Any) -> dict[str, Any]:
-    grid = {"tac.entropic_index": [1.0, 2.0]}
     """A sweep over q with five seeds of 2,000 steps, with these stages and changes."""
+    grid = {"tac.entropic_index": [1.0, 2.0]}
     return {
         "name": "s",
         "tasks": ["FetchPush"],

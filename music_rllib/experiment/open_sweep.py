@@ -98,6 +98,9 @@ class OpenSweep:
         """Keys of the nodes that have a result."""
         return {node.key for node in self.scheduler.having(*DONE)}
 
+    def is_finished(self, node: Node) -> bool:
+        return self.scheduler[node.key] in DONE
+
     @property
     def short(self) -> ShortLabels:
         """Shortens the labels of the planned runs."""
@@ -201,7 +204,7 @@ def open_started(location: SweepLocation, *, lenient: bool = False) -> OpenSweep
 
 def continued_runs_text(sweep: OpenSweep) -> list[str]:
     """A line about runs that continue finished ones with fewer `env_steps`, if there are any."""
-    left = [node for node in sweep.plan.nodes if node.key not in sweep.finished]
+    left = [node for node in sweep.plan.nodes if not sweep.is_finished(node)]
     steps = [done for node in left if (done := sweep.continued_from(node)) is not None]
     if not steps:
         return []

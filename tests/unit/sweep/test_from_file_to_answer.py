@@ -14,8 +14,9 @@ from music_rllib.config.run_settings import RunSettings
 from music_rllib.envs.tasks import Task
 from music_rllib.errors import BadInputError
 from music_rllib.experiment.open_sweep import continued_runs_text, open_sweep
-from music_rllib.experiment.plan import make_plan, remarks
+from music_rllib.experiment.plan import Node, make_plan, remarks
 from music_rllib.experiment.record import changes_since
+from music_rllib.experiment.scheduler import Scheduler, Status
 from music_rllib.program import main
 from music_rllib.report.build import build_report
 from music_rllib.report.cli import _note
@@ -168,3 +169,30 @@ def test_compare_names_the_stage_that_it_shows(tmp_path: Path) -> None:
     found, _ = compare_stage(sweep.location, None, None, minimize=False)
     assert len(found["comparisons"]) == 1
     assert (found["stage"], found["metric"]) == ("her", "evaluation/success_rate")
+
+
+def test_commands_do_not_go_through_all_runs_for_each_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    having = Scheduler.having
+    passes = []
+
+    def counted(self: Scheduler, *statuses: Status) -> list[Node]:
+        passes.append(statuses)
+        return having(self, *statuses)
+
+    counts = []
+    for seeds in (2, 20):
+        folder = tmp_path / str(seeds)
+        folder.mkdir()
+        sweep = opened(folder, document(seeds=seeds))
+        play(sweep, 1, nodes=list(sweep.plan.nodes)[:seeds])
+        monkeypatch.setattr(Scheduler, "having", counted)
+        for words in (["plan", str(folder / "sweep.yaml")], ["compare"]):
+            place = str(folder / "results")
+            where = ["--storage", place] if words[0] == "plan" else [f"{place}/s"]
+            assert main([*words, *where]) == 0
+        counts.append(len(passes))
+        passes.clear()
+        monkeypatch.setattr(Scheduler, "having", having)
+    assert counts[0] == counts[1]
