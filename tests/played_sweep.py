@@ -7,7 +7,7 @@ from typing import Any
 
 from music_rllib import names
 from music_rllib.experiment.open_sweep import OpenSweep, open_sweep
-from music_rllib.experiment.plan import Node, continuation_key, make_plan
+from music_rllib.experiment.plan import Node, make_plan
 from music_rllib.experiment.record import keep_record
 from music_rllib.results.analysis_plan import record_plan
 from music_rllib.results.read import read_sweep
@@ -59,7 +59,7 @@ def play(sweep: OpenSweep, at_ms: int, before: int = 0, nodes: list[Node] | None
                 for at in range(500, node.run.env_steps + 1, 500)
             ]
             result = publish(sweep, node, history)
-            last = sweep.store.continuation(continuation_key(node.run, node.source_key))
+            last = sweep.store.continuation(node.continuation)
             with last.new_checkpoint(node.run.env_steps):
                 pass
             sweep.scheduler.start(node.key)

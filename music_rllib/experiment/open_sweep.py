@@ -12,7 +12,7 @@ from typing import Any
 from music_rllib.config.schema import SweepConfig
 from music_rllib.envs.fingerprint import Fingerprint, differences, digest_of
 from music_rllib.errors import BadInputError, indented
-from music_rllib.experiment.plan import Node, Plan, budget_settings, continuation_key, make_plan
+from music_rllib.experiment.plan import Node, Plan, budget_settings, make_plan
 from music_rllib.experiment.scheduler import DONE, Scheduler
 from music_rllib.experiment.sweep_files import PLAN, SweepLocation, as_json, read_json
 from music_rllib.names import ShortLabels, in_runs, label_matches
@@ -44,10 +44,8 @@ class Environments:
     def same(self, task: str) -> frozenset[str]:
         """Digests of all environments that count as the task's."""
         found = {digest_of(self.now[task])} if task in self.now else set()
-        before: set[str] = set()
-        while found != before:
-            before = set(found)
-            found |= {one for pair in self.kept for one in pair if found & {*pair}}
+        while more := {one for pair in self.kept if found & {*pair} for one in pair} - found:
+            found |= more
         return frozenset(found)
 
     def earliest(self, task: str) -> str:
@@ -98,8 +96,8 @@ class OpenSweep:
         """Keys of the nodes that have a result."""
         return {node.key for node in self.scheduler.having(*DONE)}
 
-    def is_finished(self, node: Node) -> bool:
-        return self.scheduler[node.key] in DONE
+    def is_finished(self, key: str) -> bool:
+        return self.scheduler.knows(key) and self.scheduler[key] in DONE
 
     @property
     def short(self) -> ShortLabels:
@@ -117,17 +115,16 @@ class OpenSweep:
 
     def continued_from(self, node: Node) -> int | None:
         """Environment steps of the finished shorter run that `node` would continue, if any."""
-        key = continuation_key(node.run, node.source_key)
         resumes = node.key in self.existing["work"] and self.store.work_folder(node.key).names()
-        if resumes or budget_settings(node.run) or key not in self.existing[CONTINUATIONS]:
+        is_kept = node.continuation in self.existing[CONTINUATIONS]
+        if resumes or not is_kept or budget_settings(node.run):
             return None
-        steps = [steps_of(name) for name in self.store.continuation(key).names()]
+        steps = [steps_of(name) for name in self.store.continuation(node.continuation).names()]
         return max((count for count in steps if count < node.run.env_steps), default=None)
 
     def progress(self, key: str) -> str | None:
         """The progress of a run as text; None if it has neither a result nor a checkpoint."""
-        known = self.scheduler.knows(key) and self.scheduler[key] in DONE
-        if known or (key in self.existing["nodes"] and self.store.is_finished(key)):
+        if self.is_finished(key) or (key in self.existing["nodes"] and self.store.is_finished(key)):
             return FINISHED
         if key not in self.existing["work"]:
             return None
@@ -204,7 +201,7 @@ def open_started(location: SweepLocation, *, lenient: bool = False) -> OpenSweep
 
 def continued_runs_text(sweep: OpenSweep) -> list[str]:
     """A line about runs that continue finished ones with fewer `env_steps`, if there are any."""
-    left = [node for node in sweep.plan.nodes if not sweep.is_finished(node)]
+    left = [node for node in sweep.plan.nodes if not sweep.is_finished(node.key)]
     steps = [done for node in left if (done := sweep.continued_from(node)) is not None]
     if not steps:
         return []
@@ -229,7 +226,7 @@ def plan_node(node: Node) -> dict[str, Any]:
         "label": node.label,
         "input": node.source_key,
         "env_steps": node.run.env_steps,
-        "continuation": continuation_key(node.run, node.source_key),
+        "continuation": node.continuation,
         **({"code": node.run.code} if node.run.own_modules else {}),
     }
 
@@ -318,14 +315,14 @@ def changed_text(sweep: OpenSweep, runs: Iterable[FoundRun]) -> str | None:
     groups: dict[tuple[str, tuple[str, ...]], list[FoundRun]] = {}
     for run in (run for run in runs if run.differences):
         groups.setdefault((run.code, run.differences), []).append(run)
-    lines = []
+    lines, short = [], sweep.short
     for (task, changes), members in groups.items():
         more = f" and {len(changes) - SHOWN} more" if len(changes) > SHOWN else ""
         lines.append(
             f"the environment of {task} has changed since {in_runs(len(members))} used it: "
             f"{', '.join(changes[:SHOWN])}{more}"
         )
-        lines += indented([f"{sweep.short(run.label)}: {run.progress}" for run in members], SHOWN)
+        lines += indented([f"{short(run.label)}: {run.progress}" for run in members], SHOWN)
     return "\n".join((*lines, f"Choose: {ADVICE}.")) if lines else None
 
 
@@ -361,7 +358,7 @@ def decide(
     while more := {key for key, source in sources.items() if source in chosen} - chosen:
         chosen |= more
     again = [run for run in runs if run.key in chosen]
-    changed = [run for run in runs if run.differences and run not in again]
+    changed = [run for run in runs if run.differences and run.key not in chosen]
     if not keep and (text := changed_text(sweep, changed)) is not None:
         raise BadInputError(text)
     return again, changed

@@ -10,6 +10,7 @@ import itertools
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 from pydantic import BaseModel
@@ -76,6 +77,11 @@ class Node:
     def source_key(self) -> str | None:
         """Key of the node whose networks it starts from."""
         return self.input.key if self.input else None
+
+    @cached_property
+    def continuation(self) -> str:
+        """Key that it shares with the runs that differ only in their budget."""
+        return continuation_key(self.run, self.source_key)
 
 
 class Plan:

@@ -215,8 +215,7 @@ def changes_since(sweep: OpenSweep) -> Changes | None:
         old = recorded[node.label]
         lines = list(_changed_settings(runs[node.label], node.run)) if node.label in runs else []
         is_longer = (
-            old.get("continuation") == continuation_key(node.run, node.source_key)
-            and old["env_steps"] < node.run.env_steps
+            old.get("continuation") == node.continuation and old["env_steps"] < node.run.env_steps
         )
         continued = sweep.continued_from(node) if is_longer else None
         if continued is not None and _checkpointed(sweep, old["key"]) <= continued:

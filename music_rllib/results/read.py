@@ -194,7 +194,7 @@ def _reader(
         try:
             if node.key in damaged:
                 raise damaged[node.key]
-            if opened.is_finished(node):
+            if opened.is_finished(node.key):
                 lines, provenance, environment = store.lines(node.key)
                 if environment is not None:
                     provenance[names.TAG_ENVIRONMENT] = digest_of(environment)
@@ -263,6 +263,6 @@ def _causes(opened: OpenSweep, state: Mapping[str, Any]) -> dict[str, str]:
     causes: dict[str, str] = {}
     for node in opened.plan.nodes:  # a source precedes the runs that start from it
         cause = failed.get(node.label) or causes.get(node.source_key or "")
-        if cause is not None and not opened.is_finished(node):
+        if cause is not None and not opened.is_finished(node.key):
             causes[node.key] = cause
     return causes

@@ -255,7 +255,7 @@ def check_demand(sweep: OpenSweep, node_memory: float | None = None) -> None:
     Raises:
         BadInputError: A run does not fit.
     """
-    runs = [(node.stage, node.run) for node in sweep.plan.nodes if not sweep.is_finished(node)]
+    runs = [(node.stage, node.run) for node in sweep.plan.nodes if not sweep.is_finished(node.key)]
     for stage in sweep.plan.searched:
         runs += [(stage.name, run) for run in stage.points[0].runs.values()]
     if node_memory is None:

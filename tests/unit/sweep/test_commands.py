@@ -39,7 +39,7 @@ from music_rllib.experiment.open_sweep import (
     open_sweep,
     remove_damaged,
 )
-from music_rllib.experiment.plan import Node, continuation_key, make_plan
+from music_rllib.experiment.plan import Node, make_plan
 from music_rllib.experiment.record import changes_since, keep_record
 from music_rllib.experiment.scheduler import Status
 from music_rllib.experiment.sweep_files import as_json
@@ -556,7 +556,7 @@ def test_a_plan_of_ten_thousand_runs_asks_a_bucket_for_less_than_a_minute(
         MemoryFileSystem.store.clear()
         sweep = played(storage, tmp_path, runs=3 * seeds // 2, seeds=seeds)
         node = sweep.plan.nodes[0]
-        last = sweep.store.continuation(continuation_key(node.run, node.source_key))
+        last = sweep.store.continuation(node.continuation)
         with last.new_checkpoint(4000) as new:
             (new.folder / "x").touch()
         seconds = 0.0
@@ -579,7 +579,7 @@ def test_a_plan_of_ten_thousand_runs_asks_a_bucket_for_less_than_a_minute(
 def last_checkpoint(sweep: OpenSweep, env_steps: int) -> WorkFolder:
     """The folder of the first run's last checkpoint, with a checkpoint after `env_steps`."""
     node = sweep.plan.nodes[0]
-    last = sweep.store.continuation(continuation_key(node.run, node.source_key))
+    last = sweep.store.continuation(node.continuation)
     with last.new_checkpoint(env_steps) as new:
         (new.folder / "x").touch()
     return last

@@ -69,7 +69,7 @@ def test_the_largest_node_of_a_cluster_must_hold_a_run(tmp_path: Any) -> None:
     asked = run(tmp_path, tac={"hidden_sizes": [20_000, 20_000]})  # 25 GiB
     node = SimpleNamespace(stage="a", key="k", run=asked)
     plan = SimpleNamespace(nodes=[node], searched=())
-    sweep: Any = SimpleNamespace(plan=plan, finished=set())
+    sweep: Any = SimpleNamespace(plan=plan, is_finished=lambda _: False)
     with pytest.raises(BadInputError, match=r"of the cluster's largest node, 4\.0 GiB, got"):
         check_demand(sweep, Capacity(now=1, memory=4 * GIB).node_memory)
     check_demand(sweep, Capacity(now=0, grows=True, memory=4 * GIB).node_memory)
