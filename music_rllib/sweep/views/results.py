@@ -13,6 +13,7 @@ from rich.text import Text
 from music_rllib import names
 from music_rllib.command_line import clock, new_table, percent
 from music_rllib.config.run_settings import RunSettings
+from music_rllib.experiment.open_sweep import SHOWN
 from music_rllib.experiment.plan import Plan, short
 from music_rllib.experiment.scheduler import Status
 from music_rllib.names import ShortLabels
@@ -31,7 +32,8 @@ def results_table(
 ) -> Table:
     """One row for each run: its last metrics, of its result or its progress so far, and its state.
 
-    `status` and `results` are by node key.
+    `status` and `results` are by node key. Of the runs that have not started, only the first have a
+    row, and the last row has the number of the others.
     """
     metrics = _metric_columns({node.run.task.primary_metric for node in plan.nodes})
     shown = {
@@ -46,9 +48,10 @@ def results_table(
     heads = ("run", *metrics.values(), "env steps", "time", "state")
     table = new_table(f"Results of {plan.name}", heads, left=("run", "state"))
     label = ShortLabels.of(run.label for run in plan.runs)
-    for run in plan.runs:
-        if run.part:  # the run of a search: the table of trials has it
-            continue
+    runs = [run for run in plan.runs if not run.part]  # the table of trials has those of searches
+    left = [run for run in runs if status(run.key) is Status.WAITING and run.key not in results]
+    more = {run.key for run in left[SHOWN:]}
+    for run in (run for run in runs if run.key not in more):
         result, state = results.get(run.key), status(run.key)
         cells = ["-"] * (len(metrics) + 2)
         if result is not None:
@@ -61,6 +64,9 @@ def results_table(
             ]
         name = _STATES.get(state, str(state))
         table.add_row(label(run.label), *cells, name, style=_STYLES.get(state))
+    if more:
+        row = (f"and {len(more):,} more", *["-"] * (len(metrics) + 2), _STATES[Status.WAITING])
+        table.add_row(*row, style=_STYLES[Status.WAITING])
     return table
 
 

@@ -160,6 +160,17 @@ def test_results_have_a_row_per_run_in_any_state(plan: Plan) -> None:
     ], "without the task's reward, success is chance"  # fmt: skip
 
 
+def test_most_runs_that_have_not_started_share_a_row(tmp_path: Path) -> None:
+    plan = make_plan(changed(tmp_path, seeds=200))
+    last = plan.nodes[-1]
+    scheduler = Scheduler(plan, finished=[last.key])
+    result = RunResult(label="x", env_steps=2000, seconds=125, metrics={names.EVAL_SUCCESS: 0.25})
+    table = results_table(plan, scheduler.__getitem__, {last.key: result})
+    rows = [line.split() for line in shown(table).splitlines()[3:]]
+    assert [row[-1] for row in rows] == ["started"] * 10 + ["reused", "started"]
+    assert rows[-1][:3] == ["and", f"{len(plan.nodes) - 11:,}", "more"]
+
+
 class Clock:
     """A clock that the test sets."""
 
