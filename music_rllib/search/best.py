@@ -18,7 +18,7 @@ from music_rllib.config.search import SearchSettings
 from music_rllib.experiment.plan import Plan, short
 from music_rllib.names import in_runs, symbol
 from music_rllib.results.analysis import FinalScores, Scope, stage_scopes
-from music_rllib.results.conditions import ALL_TASKS, Condition, find_stages
+from music_rllib.results.conditions import ALL_TASKS, Condition, StageRuns, find_stages
 from music_rllib.results.data import Sweep
 from music_rllib.results.statistics import with_interval
 from music_rllib.search.objective import interval
@@ -47,13 +47,12 @@ def ranking_metric(stage: Stage, sweep: Sweep) -> RankingMetric:
     return RankingMetric(stage.primary_metric)
 
 
-def _scopes(stage: str, sweep: Sweep, metric: str | None) -> dict[str, Scope]:
+def _scopes(runs: StageRuns | None, sweep: Sweep, metric: str | None) -> dict[str, Scope]:
     """Final values of a stage's conditions, first over all tasks if these have the same scale.
 
     `metric` is None for the primary metric of each task.
     """
-    found = next((one for one in find_stages(sweep) if one.name == stage), None)
-    scopes = () if found is None else stage_scopes(sweep, found, metric)
+    scopes = () if runs is None else stage_scopes(sweep, runs, metric)
     return {scope.name: scope for scope in scopes}
 
 
@@ -66,7 +65,13 @@ def condition_of(
     best: Mapping[str, Any], stage: Stage, plan: Plan, sweep: Sweep, metric: str
 ) -> FinalScores | None:
     """The condition that :func:`best_so_far` has described; None if it has no final value."""
-    scopes = _scopes(stage.name, sweep, metric)
+    runs = {found.name: found for found in find_stages(sweep)}
+    return _condition_in(best, stage, plan, sweep, _scopes(runs.get(stage.name), sweep, metric))
+
+
+def _condition_in(
+    best: Mapping[str, Any], stage: Stage, plan: Plan, sweep: Sweep, scopes: Mapping[str, Scope]
+) -> FinalScores | None:
     scope = scopes.get(best.get("task", next(iter(scopes), "")))
     for final in () if scope is None else scope.finals:
         same_seeds = stage.search is None or final.condition.is_fresh == best["on_fresh_seeds"]
@@ -86,27 +91,32 @@ def best_so_far(
     `sweep` has the runs of the plan, and `searches` is the `outcome` of its searches so far.
     """
     by_stage = {search["stage"]: search for search in searches}
+    found = {runs.name: runs for runs in find_stages(sweep)} if stages else {}
     for stage in reversed(stages):
+        runs = found.get(stage.name)
         if stage.search is None:
-            best = _best_condition(stage, plan, sweep)
+            best = _best_condition(stage, runs, plan, sweep)
         else:
             best = _best_trial(stage, stage.search, by_stage.get(stage.name))
         if best is not None:
             entropies = {
                 metric: {"value": final.value, "interval": [*final.estimate.numbers[1:]]}
                 for metric in names.ENTROPIES
-                if (final := condition_of(best, stage, plan, sweep, metric)) is not None
+                if (final := _condition_in(best, stage, plan, sweep, _scopes(runs, sweep, metric)))
+                is not None
             }
             return best | {"entropies": entropies}
     return None
 
 
-def _best_condition(stage: Stage, plan: Plan, sweep: Sweep) -> dict[str, Any] | None:
+def _best_condition(
+    stage: Stage, runs: StageRuns | None, plan: Plan, sweep: Sweep
+) -> dict[str, Any] | None:
     """The best condition, or that of each task if the metric's scale differs between tasks.
 
     In the second case, the row of the first task has the others under `other_tasks`.
     """
-    scopes = _scopes(stage.name, sweep, None)
+    scopes = _scopes(runs, sweep, None)
     if ALL_TASKS in scopes:
         scopes = {ALL_TASKS: scopes[ALL_TASKS]}
     several = len(scopes) > 1
