@@ -312,36 +312,41 @@ def test_fetchslide_in_both_forms() -> None:
 
 
 def test_the_papers_own_setting() -> None:
-    first, pilot, every = "claims-paper-setting", "paper-setting-alpha", 320
-    late, starts = {}, []
-    for study in (first, pilot):
+    every, rates, starts, planned_runs = 320, {}, [], []
+    studies = ("claims-paper-setting", "paper-setting-alpha", "paper-setting-long")
+    for study in studies:
         assert set(exported(study)["param.evaluation.episodes"].astype(int)) == {every}
+        assert set(exported(study)["param.music.batch_trajectories"]) == {"32"}
         values = pd.read_parquet(DATA / study / "metrics.parquet").sort_values("env_steps")
         moved = values[values.metric == "evaluation/object_moved_share"].groupby("run").value
-        for run, alpha in runs(study, "music-r").set_index("run").alpha.items():
-            late[alpha] = curve(study, run, MEAN)[1][-5:]
-            assert round(10 * moved.get_group(run).iloc[-12:].mean()) >= 9
+        for run in runs(study, "music-r").itertuples():
+            rates[study, run.alpha, run.q] = curve(study, run.run, MEAN)[1]
+            assert round(10 * moved.get_group(run.run).iloc[-12:].mean()) >= 9
         (before,) = runs(study, "pretrain").run
         starts.append(curve(study, before, MEAN)[1][0])
-    order = ("0.2", "0.02", "0.05", "0.5")
-    counts = [round(late[alpha].sum() * every) for alpha in order]
-    shares = "{:.1%}, {:.1%}, {:.1%} and {:.1%}".format(*(late[alpha].mean() for alpha in order))
+        assert f"complete, {len(exported(study))} of {len(exported(study))} runs" in TEXT
+        epochs = {run.budget // 80_000 for run in runs(study, "music-r").itertuples()}
+        planned_runs.append((runs(study, "pretrain").budget.item() // 80_000, *epochs))
+    assert planned_runs == [(5, 15), (5, 15), (10, 25)]
+    first, pilot, longer = studies
+    assert "20 of the paper's 100 epochs (5 of MUSIC-u and 15 of MUSIC-r" in TEXT
+    assert "35 epochs (10 and 25), at α = 0.2 with q = 1 and 1.5 (" in TEXT
+    late = [rates[first, "0.2", "1"][-5:]]
+    late += [rates[pilot, alpha, "1"][-5:] for alpha in ("0.02", "0.05", "0.5")]
+    counts = [round(one.sum() * every) for one in late]
+    shares = "{:.1%}, {:.1%}, {:.1%} and {:.1%}".format(*(one.mean() for one in late))
     each = "{} (α = 0.2), {} (0.02), {} (0.05) and {} (0.5)".format(*counts)
     assert f"succeed in {each} of {5 * every:,} episodes ({shares}), " in TEXT
-    ends = " and ".join(str(round(start * every)) for start in starts)
-    share = " and ".join(f"{start:.1%}" for start in starts)
+    one, half = (rates[longer, "0.2", q][-10:] for q in ("1", "1.5"))
+    each = f"{one.sum() * every:.0f} (q = 1) and {half.sum() * every:.0f} (q = 1.5)"
+    shares = f"{one.mean():.1%} and {half.mean():.1%}"
+    assert f"the longer runs in {each} of {10 * every:,} ({shares}), before" in TEXT
+    ends = "{:.0f}, {:.0f} and {:.0f}".format(*(start * every for start in starts))
+    share = "{:.1%}, {:.1%} and {:.1%}".format(*starts)
     assert f"before any training in {ends} of {every} ({share})" in TEXT
-    assert f"complete, {len(exported(first))} of 2 runs" in TEXT
-    assert f"complete, {len(exported(pilot))} of 4 runs" in TEXT
-    own = exported(first).iloc[0]
-    of = own["param.music.batch_trajectories"]
-    trained = f"trained on {of} trajectories in place of the original's 4,096"
-    assert f"{trained}, and α = {own['tag.alpha']} (" in TEXT
-    epochs = [runs(first, stage).budget.item() // 80_000 for stage in ("pretrain", "music-r")]
-    assert (
-        f"{sum(epochs)} of the paper's 100 epochs ({epochs[0]} of MUSIC-u and {epochs[1]}" in TEXT
-    )
-    assert {int(one) for one in runs(pilot, "music-r").budget} == {80_000 * epochs[1]}
+    # Thresholds: 50 % for the first run and the longer ones, 15 % for other α.
+    assert max(map(np.mean, (late[0], one, half))) < 0.5
+    assert max(map(np.mean, late[1:])) < 0.15
 
 
 def test_the_bonus_for_moving_the_object() -> None:
