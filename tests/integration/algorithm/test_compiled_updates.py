@@ -343,9 +343,10 @@ def test_compiled_training_equals_autograd_to_rounding(
     expected = fingerprint(build(**settings), rounds)
     assert found != expected, "they round differently: else both took the same way"
     for row, same in zip(found, expected, strict=True):
-        # Rewards of objects at rest are at the lowest value, up to rounding of the bound.
+        # Rewards of objects at rest are at the lowest value, up to rounding of the bound: the share
+        # of those that are exactly there differed by up to 0.02 (AMD EPYC without AVX-512).
         counted = row.pop(names.MI_REWARD_LOWEST, 0.0)
-        assert counted == pytest.approx(same.pop(names.MI_REWARD_LOWEST, 0.0), abs=0.01)
+        assert counted == pytest.approx(same.pop(names.MI_REWARD_LOWEST, 0.0), abs=0.05)
         assert row == pytest.approx(same, rel=1e-3, abs=1e-4)
 
 
