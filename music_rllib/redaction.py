@@ -136,12 +136,8 @@ def without_secrets(
     return {
         str(key): _clean((*path, str(key)), value)
         for key, value in settings.items()
-        if of_tasks or not _is_secret(str(key), value)
+        if of_tasks or not _names_a_secret(str(key), counted=isinstance(value, int | float))
     }
-
-
-def _is_secret(key: str, value: object) -> bool:
-    return _names_a_secret(key, counted=isinstance(value, int | float))
 
 
 # The runs of a sweep have the same names and nearly the same values of settings.
